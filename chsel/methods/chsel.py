@@ -26,7 +26,6 @@ from chsel.qd.measures import measure_named
 from chsel.qd.selection import (
     ArchiveSettings,
     OutputSettings,
-    measure_range,
     ranked_hypotheses,
     select_elites,
     sized_archive,
@@ -110,9 +109,8 @@ class _Algorithm1:
         # 2: P <- m(E')
         estimates = evaluated(objective, measure, vectors, costs)
         # 3: mu, sigma <- mean and standard deviation of P
-        mean, deviation = measure_range(estimates, measure, settings, known_count)
         # 4: M <- grid with dimensions mu +- b_sigma sigma
-        archive = sized_archive(measure, mean, deviation, settings, space.dimension)
+        archive = sized_archive(estimates, measure, settings, known_count, space.dimension)
         # 5: M <- UpdateCells(M, E' and E_l)
         archive.update_cells(estimates, evaluated(objective, measure, space.encode(low_cost_set)))
         # 6: M <- CMA-MEGA(M, C^, n_o)

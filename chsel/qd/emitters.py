@@ -19,7 +19,7 @@ from chsel.cost.objective import (
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.pose_tuples import all_finite
-from chsel.problem.registration_problem import NullObserver, Observer
+from chsel.problem.registration_problem import Observer
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd.archive import (
@@ -39,8 +39,7 @@ from chsel.qd.measures import measure_gradients_of, measures_of
 
 SEARCHES = "cma_mega", "cma_me"  # Fontaine and Nikolaidis, 2021; Fontaine et al., 2020
 MOST_ITERATIONS = 1_000_000
-_TRACED = 10  # iterations between two traces
-_MOST_NORMALS = 4_000_000  # normal numbers held at once, 8 bytes each
+_TRACED = 10  # iterations between two traces; even, so that no pair of normal numbers is split
 _EPSILON = 1e-8  # keeps the normalisation of a zero gradient finite
 
 
@@ -269,7 +268,6 @@ def fill_archive(
 
     CMA-MEGA: theta, at first `start` (d,), with its gradients, and branches around it. CMA-ME:
     samples of an evolution strategy, whose first mean is `start`. refinement: index of the pass.
-    No random number depends on how many are drawn at a time.
     """
     measures, total = archive.measure.count, settings.iterations
     search: MegaSearch | MeSearch
@@ -282,24 +280,17 @@ def fill_archive(
     landscape = Landscape(model, space, archive.measure.code, objective.work())
     stream = key.stream(Purpose.EMITTER, refinement)
     elites = key.stream(Purpose.RESTART, refinement).random(total)
-    # A multiple of 10, so that no pair of normal numbers is split.
-    block = 10 * max(1, min(100, _MOST_NORMALS // (10 * batch * dimension)))
-    is_watched = type(observer) is not NullObserver
-    interval = observer.snapshot_interval or _TRACED
-    if is_watched:
-        observer.trace(name, 0, archive.solutions, archive.costs)
-        observer.snapshot(archive.snapshot(0, refinement))
-    for begin in range(0, total, block):
-        end = min(begin + block, total)
+    interval = observer.snapshot_interval or total
+    observer.trace(name, 0, archive.solutions, archive.costs)
+    observer.snapshot(archive.snapshot(0, refinement))
+    for begin in range(0, total, _TRACED):
+        end = min(begin + _TRACED, total)
         random = RandomNumbers(normals(stream, (end - begin, batch, dimension)), elites[begin:end])
-        between = range(begin + 1, end if is_watched else begin)
-        stops = [n for n in between if n % _TRACED == 0 or n % interval == 0]
+        stops = [n for n in range(begin + 1, end) if n % interval == 0]
         for first, last in pairwise([begin, *stops, end]):
             run(landscape, archive.cells, search, random, first - begin, last - begin)
-            if is_watched and (last % _TRACED == 0 or last == total):
+            if last == end:
                 observer.trace(name, last, archive.solutions, archive.costs)
                 observer.progress(name, last, total)
-            if is_watched and (
-                last == total or (observer.snapshot_interval and last % interval == 0)
-            ):
+            if last == total or last % interval == 0:
                 observer.snapshot(archive.snapshot(last, refinement))

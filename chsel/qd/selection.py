@@ -97,22 +97,19 @@ class OutputSettings(CheckedSettings):
     }
 
 
-def measure_range(
-    estimates: Evaluated, measure: Measure, settings: ArchiveSettings, known_count: int
-) -> tuple[FloatArray, FloatArray]:
-    """Mean and standard deviation (k,) of the measures of estimates E' that are no outliers."""
-    kept = estimates.measures[_inliers(estimates.costs, settings, known_count)]
-    return measure.moments(kept if len(kept) >= 2 else estimates.measures)
-
-
 def sized_archive(
+    estimates: Evaluated,
     measure: Measure,
-    mean: FloatArray,
-    deviation: FloatArray,
     settings: ArchiveSettings,
+    known_count: int,
     dimension: int,
 ) -> GridArchive:
-    """An empty archive of vectors (d,) with the range mean +- b_sigma deviations (k,)."""
+    """An empty archive of vectors (d,) with the range mean +- b_sigma standard deviations (k,).
+
+    Of the measures of estimates E' that are no outliers, by the number of known points.
+    """
+    kept = estimates.measures[_inliers(estimates.costs, settings, known_count)]
+    mean, deviation = measure.moments(kept if len(kept) >= 2 else estimates.measures)
     half = settings.range_sigmas * np.maximum(deviation, settings.least_deviation)
     if measure.circular:
         half = np.minimum(half, np.pi)

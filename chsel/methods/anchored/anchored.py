@@ -26,21 +26,11 @@ from chsel.problem.registration_problem import (
 )
 from chsel.problem.search_space import origin_bounds, search_space
 from chsel.problem.streams import Purpose
-from chsel.problem.subset import (
-    evenly_spaced,
-    facilities,
-    farthest_poses,
-    squared_distances,
-)
+from chsel.problem.subset import evenly_spaced, facilities, farthest_poses, squared_distances
 from chsel.problem.surface import object_centre
 from chsel.qd.archive import Evaluated
 from chsel.qd.measures import measure_named
-from chsel.qd.selection import (
-    measure_range,
-    ranked,
-    repeated,
-    sized_archive,
-)
+from chsel.qd.selection import ranked, repeated, sized_archive
 
 _MOST_ROUNDS = 12
 # While minima are sought, contacts and free voxels draw from far.
@@ -251,15 +241,15 @@ class Search:
         measure = measure_named(settings.measure, planar=self._settings.plane is not None)
         vectors = space.encode(poses)
         offered = Evaluated(vectors, candidates.energies, measure.values(space, vectors))
-        mean, deviation = measure_range(offered, measure, settings, len(problem.points.known))
-        archive = sized_archive(measure, mean, deviation, settings, space.dimension)
-        archive.update_cells(offered)
+        known = len(problem.points.known)
+        archive = sized_archive(offered, measure, settings, known, space.dimension)
+        offers = archive.add(vectors, -candidates.energies, offered.measures)
         self._observer.snapshot(archive.snapshot(0, 0))
         last = archive.snapshot(0, 0)  # one of our own: an observer may change what it gets
         elites = space.poses(last.solutions)
-        cells = archive.cells_of(offered.measures[chosen])
         hypotheses = space.poses(vectors[chosen])
         energies = self.energy.of(hypotheses)
+        cells = offers.cells[chosen]
         found = ranked(hypotheses.matrices, energies, cells, elites.matrices, last)
         return replace(found, candidates=poses.matrices)
 
