@@ -100,7 +100,7 @@ class PoseGridSettings(CheckedSettings):
 
 @dataclass(frozen=True)
 class ModeSearchSettings(CheckedSettings):
-    """How members are sought in modes between the poses of the grid, see modes_between.
+    """How members are sought in modes between the poses of the grid.
 
     Poses of the grid climb if their mean over known points is less than `distance` above the true
     pose's, and few points are deeper than `depth` on the wrong side.
@@ -115,11 +115,7 @@ class ModeSearchSettings(CheckedSettings):
 
 @dataclass(frozen=True)
 class PlausibleSettings(CheckedSettings):
-    """The plausible set P_eps = {X : C(X) < C(X*) + eps} (CHSEL, Sec. III and V).
-
-    Without rescan, steps after the first look only at the members of the one before, which is
-    exact only where C cannot fall as points are added, as with sums.
-    """
+    """The plausible set P_eps = {X : C(X) < C(X*) + eps} (CHSEL, Sec. III and V)."""
 
     epsilon: Annotated[float, positive] = 0.001  # eps, metres
     cost: EvaluationCostSettings = field(default_factory=EvaluationCostSettings)  # C
@@ -127,7 +123,6 @@ class PlausibleSettings(CheckedSettings):
     members: Annotated[int, positive] = 1000  # kept for evaluation at most, a random subset
     # With fewer members on the grid, others are sought around them; 0: never.
     fill_to: Annotated[int, not_negative] = 30
-    rescan: bool = True  # look at all poses at every step
     modes: ModeSearchSettings | None = None  # how to look for members far from all on the grid
 
     def __post_init__(self) -> None:
@@ -137,11 +132,8 @@ class PlausibleSettings(CheckedSettings):
 
     @property
     def text(self) -> str:
-        """All settings as JSON; without modes as before they existed, so that digests stay."""
-        mapping = settings_mapping(self)
-        if self.modes is None:
-            del mapping["modes"]
-        return json.dumps(mapping, sort_keys=True)
+        """All settings as JSON."""
+        return json.dumps(settings_mapping(self), sort_keys=True)
 
     @property
     def digest(self) -> str:

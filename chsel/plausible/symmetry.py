@@ -31,8 +31,6 @@ _TESTED = 1000  # points by which a rotation is tested
 _POINTS = 20_000  # points that mark the cells of the coarse grid
 _CELLS = 48  # of the coarse grid, along each axis
 _AT_ONCE = 2000  # rotations
-_MOST_FACES = 100_000  # above this, vertices are merged
-_MERGED = 128  # cells along the longest side
 _ON_SURFACE = 1e-6  # of the radius: nearer, the face's normal is the better direction
 _DAMPING = 1e-4
 
@@ -127,16 +125,13 @@ class RotatedSurface:
         import trimesh
 
         vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
-        corners, normals = _corners_normals(vertices, faces)
+        corners = vertices[faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         areas = np.sqrt((normals**2).sum(axis=1))  # twice the areas of faces
         self.centre, self.radius = corners.reshape(-1, 3).mean(axis=0), 0.0
         if not areas.sum() > 0.0:
             return
         self.centre = (areas[:, None] * corners.mean(axis=1)).sum(axis=0) / areas.sum()
-        if len(faces) > _MOST_FACES:
-            vertices, faces = _merged(vertices, faces)
-            corners, normals = _corners_normals(vertices, faces)
-            areas = np.sqrt((normals**2).sum(axis=1))
         self.radius = float(np.sqrt(((corners - self.centre) ** 2).sum(axis=-1)).max())
         self.corners = (corners - self.centre) / self.radius
         self.normals = normals / np.maximum(areas, 1e-300)[:, None]
@@ -203,26 +198,6 @@ def _cells(points: FloatArray) -> tuple[IntArray, IntArray, IntArray]:
     """Indices of the cells in which points (..., 3) of the unit ball are."""
     index = np.clip(((points + 1.0) * (_CELLS / 2)).astype(np.int64), 0, _CELLS - 1)
     return index[..., 0], index[..., 1], index[..., 2]
-
-
-def _corners_normals(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Corners (F, 3, 3) of faces, and normals (F, 3) as long as twice their areas."""
-    corners = vertices[faces]
-    sides = corners[:, 1:] - corners[:, :1]
-    return corners, np.cross(sides[:, 0], sides[:, 1])
-
-
-def _merged(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """Vertices (V, 3), those of a cell as their mean, and the faces (F, 3) that this leaves."""
-    used = vertices[faces]
-    lower, upper = used.min(axis=(0, 1)), used.max(axis=(0, 1))
-    cell = np.floor((vertices - lower) * (_MERGED / (upper - lower).max())).astype(np.int64)
-    key = (cell[:, 0] * (_MERGED + 1) + cell[:, 1]) * (_MERGED + 1) + cell[:, 2]
-    _, index, count = np.unique(key, return_inverse=True, return_counts=True)
-    sums = [np.bincount(index, weights=vertices[:, axis]) for axis in range(3)]
-    faces = index[faces]
-    a, b, c = faces.T
-    return np.stack(sums, axis=1) / count[:, None], faces[(a != b) & (b != c) & (c != a)]
 
 
 def _axes_of_revolution(surface: RotatedSurface) -> FloatArray:

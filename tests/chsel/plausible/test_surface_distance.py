@@ -122,28 +122,6 @@ def test_coverage_and_plausibility_are_the_means_of_the_nearest() -> None:
     assert metrics.root == pytest.approx(5.5**0.5)
 
 
-def test_the_terms_swap_as_the_two_sets_do(box: tuple[SdfGrid, trimesh.Trimesh]) -> None:
-    """With the distance of both directions, which does not tell who is the estimate."""
-    distance = distance_of(box, method="exact", bidirectional=True)
-    one, other = poses(4, 6), poses(5, 9)
-    forth = plausible_diversity(distance.between(inverse(one), other))
-    back = plausible_diversity(distance.between(inverse(other), one))
-    assert forth.coverage == pytest.approx(back.plausibility, rel=1e-9)
-    assert forth.plausibility == pytest.approx(back.coverage, rel=1e-9)
-    assert forth.coverage != pytest.approx(forth.plausibility, rel=1e-3)
-
-
-def test_both_directions_are_the_mean_of_each(box: tuple[SdfGrid, trimesh.Trimesh]) -> None:
-    one, other = poses(6, 3, spread=0.1, angle=1.0), poses(7, 4, spread=0.1, angle=1.0)
-    for method in ("exact", "grid"):
-        single = distance_of(box, method=method)
-        forth = single.between(inverse(one), other)
-        back = single.between(inverse(other), one).T
-        both = distance_of(box, method=method, bidirectional=True).between(inverse(one), other)
-        np.testing.assert_allclose(both, (forth + back) / 2.0, rtol=1e-9)
-        assert not np.allclose(forth, back, rtol=0.02)
-
-
 def test_moving_everything_alike_changes_nothing(box: tuple[SdfGrid, trimesh.Trimesh]) -> None:
     estimates, members = poses(8, 5), poses(9, 7)
     motion = compose(random_rotations(np.random.default_rng(10), 1), np.array([[0.5, -1.0, 2.0]]))
