@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
@@ -52,19 +53,12 @@ class Offsets:
     z: Axis = ((0.0, 0.1, 15),)
 
     def __post_init__(self) -> None:
-        count = 1
-        for name in ("x", "y", "z"):
-            axis = getattr(self, name)
-            if not axis:
-                raise SettingError(f"{name} has no piece; accepted: at least one")
-            for piece in axis:
-                if not np.isfinite(piece[:2]).all() or piece[2] < 1:
-                    raise SettingError(
-                        f"{name} has the piece {list(piece)}; accepted: [first, last, count], "
-                        "finite metres, a count of at least 1"
-                    )
-            count *= sum(piece[2] for piece in axis)
-        require_at_most("the number of offsets", count, MOST_POSITIONS)
+        counts = [sum(piece[2] for piece in axis) for axis in (self.x, self.y, self.z)]
+        if min(counts) < 1:
+            raise SettingError(
+                f"offsets are {counts} along x, y and z; accepted: at least one along each"
+            )
+        require_at_most("the number of offsets", math.prod(counts), MOST_POSITIONS)
 
     def points(self) -> FloatArray:
         """All offsets (P, 3), those along z fastest."""

@@ -120,7 +120,7 @@ def scan_grid(cost: EvaluationCost, grid: PoseGrid, limit: float) -> tuple[IntAr
     scan = Scan(
         model=cost.model,
         bounds=_bounds(cost.problem.sdf, cost.settings.lookup),
-        beyond=_beyond(cost.problem.sdf, cost.settings.outside),
+        is_farther=_is_farther(cost.problem.sdf, cost.settings.outside),
         rotations=Poses.of(inverse(compose(grid.rotations, np.zeros(3)))).numbers,
         positions=grid.positions,
         known=points.known[order].T.copy(),
@@ -154,16 +154,13 @@ def scan_grid(cost: EvaluationCost, grid: PoseGrid, limit: float) -> tuple[IntAr
     pieces = [piece for first in sorted(found) for piece in found[first]]
     index = np.concatenate([piece[0] for piece in pieces])
     if len(index) > MOST_MEMBERS:
-        raise EvaluationError(_too_many(cost, limit))
+        violation = cost.model.violation / cost.model.divisors.free
+        raise EvaluationError(
+            f"more than {MOST_MEMBERS:_} poses cost less than {limit:.4g} with {points.count} "
+            f"known points (a violated point: {violation:.4g}); accepted: more known points, a "
+            "smaller epsilon or a larger cost.tolerance"
+        )
     return index, np.concatenate([piece[1] for piece in pieces])
-
-
-def _too_many(cost: EvaluationCost, limit: float) -> str:
-    count, violation = cost.problem.points.count, cost.model.violation / cost.model.divisors.free
-    text = f"more than {MOST_MEMBERS:_} poses cost less than {limit:.4g} with {count} known points"
-    if limit >= violation:
-        text += f", as the true pose costs that much itself (a violated point: {violation:.4g})"
-    return text + "; accepted: more known points, a smaller epsilon or a larger cost.tolerance"
 
 
 def _most_informative_first(known: FloatArray) -> IntArray:
@@ -186,20 +183,14 @@ def _bounds(sdf: SdfGrid, lookup: str) -> FloatArray:
     return np.stack([least - rounding, greatest + rounding]).reshape(2, -1)
 
 
-def _beyond(sdf: SdfGrid, outside: str) -> tuple[float, float]:
-    """Weights (w, u) of d^2 and s^2 in the least squared distance beyond the grid.
+def _is_farther(sdf: SdfGrid, outside: str) -> bool:
+    """Whether the surface is at least as far from a point beyond the grid as the grid's box is.
 
-    d: to its box; s: what its nearest point reads. With gradients that point out of the box, the
-    way to the surface is at least as long as both together; with others, it may be of any length.
+    With gradients that point out of the box it is; with others, the way may be of any length.
     """
-    if outside == "bounding_box":
-        return 1.0, 0.0
-    for axis in range(3):
-        for end, sign in ((0, -1.0), (-1, 1.0)):
-            face = np.take(sdf.gradients[..., axis], end, axis=axis)
-            if (sign * face).min() <= _LEAST_OUTWARD:
-                return 0.0, 0.0
-    return 1.0, 1.0
+    ends = [(axis, end, sign) for axis in range(3) for end, sign in ((0, -1.0), (-1, 1.0))]
+    faces = [sign * np.take(sdf.gradients[..., axis], end, axis=axis) for axis, end, sign in ends]
+    return outside == "bounding_box" or min(face.min() for face in faces) > _LEAST_OUTWARD
 
 
 class Scan(NamedTuple):
@@ -207,7 +198,7 @@ class Scan(NamedTuple):
 
     model: EvaluationModel
     bounds: FloatArray  # (2, nodes), see _bounds
-    beyond: tuple[float, float]  # see _beyond
+    is_farther: bool  # see _is_farther
     rotations: FloatArray  # (R, 12), object_from_world, of poses at the origin
     positions: FloatArray  # (P, 3), world
     known: FloatArray  # (3, M), world, the most informative first
@@ -233,8 +224,8 @@ class ScanBuffer(NamedTuple):
 def scan_rotations(scan: Scan, first: int, last: int, buffer: ScanBuffer) -> tuple[int, int]:
     """Collect the poses below the limit, of rotations from `first` to before `last`.
 
-    Returns the rotation to go on with, which is less than `last` where the buffer may be too small
-    for it, and the number of poses in the buffer.
+    Returns the rotation to go on with, before `last` where the buffer may be too small, and the
+    number of poses in the buffer.
     """
     known, positions = scan.known, scan.positions
     points, shifts, total, count = buffer.points, buffer.shifts, buffer.total, 0
@@ -280,10 +271,7 @@ def _may_be_below(scan: Scan, buffer: ScanBuffer, start: int) -> bool:
 
 @leaf
 def _add_bounds(scan: Scan, buffer: ScanBuffer, start: int, m: int) -> None:
-    """Add what the m-th known point costs at least at positions from `start` on.
-
-    Its place in the grid is that of the exact cost, to the bit.
-    """
+    """Add what the m-th known point costs at least at positions from `start` on."""
     box, bounds, shifts = scan.model.field.box, scan.bounds, buffer.shifts
     beyond, cell, total = buffer.beyond, buffer.cell, buffer.total
     first, last, most, inverse = box.first, box.last, box.most, box.inverse
@@ -299,13 +287,12 @@ def _add_bounds(scan: Scan, buffer: ScanBuffer, start: int, m: int) -> None:
         e = node_of((e - first[1]) * inverse, box.between, most[1])
         f = node_of((f - first[2]) * inverse, box.between, most[2])
         cell[i] = np.int32(d * box.across + e * box.along + f)
-    value, weights = scan.known_sdf[m], scan.beyond
+    value = scan.known_sdf[m]
     for i in range(_LANES):
         at = np.uint64(cell[i])
         least, greatest = bounds[0, at], bounds[1, at]
         inside = max(least - value, value - greatest)
-        least = max(least, 0.0)
-        outside = np.sqrt(weights[0] * beyond[i] + weights[1] * (least * least)) - value
+        outside = np.sqrt(beyond[i]) - value if scan.is_farther else 0.0
         total[i] += max(outside if beyond[i] > 0.0 else inside, 0.0)
 
 
@@ -333,8 +320,7 @@ class TruePoseSettings(CheckedSettings):
             )
 
 
-@dataclass(frozen=True, eq=False)
-class TruePose:
+class TruePose(NamedTuple):
     """The pose of least evaluation cost near a guess."""
 
     world_from_object: FloatArray  # (4, 4)

@@ -203,10 +203,9 @@ def _cells(points: FloatArray) -> tuple[IntArray, IntArray, IntArray]:
 def _axes_of_revolution(surface: RotatedSurface) -> FloatArray:
     """Unit axes (A, 3) about which every rotation matches: none, one, or two of a sphere's.
 
-    Candidates are the axes of inertia and those of slippage. The normals of a surface of revolution
-    meet its axis: rotations about u move points p within the surface where n . (u x p) = 0 (Gelfand
-    and Guibas, 2004, "Shape segmentation using local slippage analysis"). Slippage finds the axis
-    where moments of inertia are equal by chance, inertia where the normals of a scan are noise.
+    Candidates are the axes of inertia, which bear noise of normals, and those of slippage, which
+    bear equal moments: rotations about u move points p within the surface where n . (u x p) = 0
+    (Gelfand and Guibas, 2004).
     """
     middles = (surface.corners + np.roll(surface.corners, 1, axis=1)) / 2.0  # exact for squares
     slips = np.cross(middles, surface.normals[:, None])
@@ -237,8 +236,8 @@ def _half_turn_across(surface: RotatedSurface, axis: FloatArray) -> FloatArray:
 def _finite_group(surface: RotatedSurface) -> FloatArray:
     """The symmetries (S, 3, 3) of a surface without an axis of revolution, the identity first.
 
-    Of rotations spread over SO(3), those that match better than their neighbours on a coarse grid
-    are aligned with the surface. Each, the best first, joins the group if all products match.
+    Rotations that match better than their neighbours on a coarse grid are aligned with the surface.
+    Each, the best first, joins the group if all products match.
     """
     spread, neighbours = _spread()
     coarse = surface.coarse_errors(spread)
