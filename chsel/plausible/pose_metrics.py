@@ -122,7 +122,7 @@ def plausible_diversity(distances: FloatArray) -> PlausibleDiversity:
 def true_pose_rank(
     distance: SurfaceDistance, object_from_world: FloatArray, world_from_object: FloatArray
 ) -> float:
-    """Share in (0, 1] of true pose (4, 4) and hypotheses (B, 4, 4) at least as far out as the former.
+    """Share in (0, 1] of the true pose (4, 4) and hypotheses (B, 4, 4) at least as far out as it.
 
     Uniform over many registrations if these are calibrated, small if the set is too narrow, or off.
     Raises EvaluationError for fewer than 2 hypotheses.
