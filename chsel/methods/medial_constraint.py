@@ -458,9 +458,6 @@ class MedialConstraintCmaMeSettings:
         "reference": {},
     }
 
-    def __post_init__(self) -> None:
-        measure_named(self.archive.measure, planar=self.plane is not None)
-
 
 class MedialConstraintCmaMe(ConfiguredMethod[MedialConstraintCmaMeSettings]):
     """CMA-ES from E_0, then CMA-ME over an archive around what it finds; costs are in m^2."""
