@@ -185,23 +185,20 @@ def _cost(model: EvaluationModel, free: int, occupied: int, total: float) -> flo
 @spliced
 def _known_sum(model: EvaluationModel, pose: Pose, scratch: EvaluationScratch) -> float:
     """sum |s - v| over the points of known signed distance, in their order."""
-    known, total = model.known, 0.0
-    locate(pose, model.field.box, known[0], known[1], known[2], scratch.places, known.shape[1])
-    for n in range(known.shape[1]):
-        x, y, z = known[0, n], known[1, n], known[2, n]
-        s = distance_in_place(model.field, pose, x, y, z, scratch.places, n)[0]
+    xs, ys, zs, total = model.known[0], model.known[1], model.known[2], 0.0
+    locate(pose, model.field.box, xs, ys, zs, scratch.places, len(xs))
+    for n in range(len(xs)):
+        s = distance_in_place(model.field, pose, xs[n], ys[n], zs[n], scratch.places, n)[0]
         total += abs(s - model.known_sdf[n])
     return total
 
 
 @spliced
 def _occupied_count(model: EvaluationModel, pose: Pose, scratch: EvaluationScratch) -> int:
-    occupied, count = model.occupied, 0
-    places, number = scratch.places, occupied.shape[1]
-    locate(pose, model.field.box, occupied[0], occupied[1], occupied[2], places, number)
-    for n in range(number):
-        x, y, z = occupied[0, n], occupied[1, n], occupied[2, n]
-        s = distance_in_place(model.field, pose, x, y, z, places, n)[0]
+    xs, ys, zs, count = model.occupied[0], model.occupied[1], model.occupied[2], 0
+    locate(pose, model.field.box, xs, ys, zs, scratch.places, len(xs))
+    for n in range(len(xs)):
+        s = distance_in_place(model.field, pose, xs[n], ys[n], zs[n], scratch.places, n)[0]
         count += 1 if s >= -model.level else 0
     return count
 

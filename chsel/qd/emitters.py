@@ -231,8 +231,7 @@ def mega_search(
     epsilon: float = EPSILON,
 ) -> MegaSearch:
     """CMA-MEGA at theta = start (d,), with so many measures and branches; epsilon is Adam's."""
-    d, n = len(start), measures + 1
-    parity = settings.ribs_parity
+    d, n, parity = len(start), measures + 1, settings.ribs_parity
     return MegaSearch(
         theta=np.array(start, dtype=np.float64),
         measures=np.zeros(measures),
@@ -270,11 +269,10 @@ def fill_archive(
     samples of an evolution strategy, whose first mean is `start`. refinement: index of the pass.
     """
     measures, total = archive.measure.count, settings.iterations
-    search: MegaSearch | MeSearch
+    search: Any = me_search(start, measures, count, settings)
+    run = me_iterations
     if name == "cma_mega":
         run, search = mega_iterations, mega_search(start, measures, max(count - 1, 1), settings)
-    else:
-        run, search = me_iterations, me_search(start, measures, count, settings)
     batch, dimension = search.strategy.batch, len(search.strategy.mean)
     model, space = objective.model, objective.space_arrays
     landscape = Landscape(model, space, archive.measure.code, objective.work())

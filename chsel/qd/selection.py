@@ -40,20 +40,10 @@ class ArchiveSettings(CheckedSettings):
     tolerance_per_point: Annotated[float, not_negative] = 1e-3  # tolerance per known point
     tolerance: Annotated[float, not_negative] = 1e-6  # its floor
 
+    _OTHERS: ClassVar = {"measure": "position_2", "bins": 40, "least_deviation": 1e-4}
     presets: ClassVar[Presets] = {
-        "paper": {
-            "measure": "position_2",
-            "bins": 40,
-            "least_deviation": 1e-4,
-            "outliers": "none",
-        },
-        "reference": {
-            "measure": "position_2",
-            "bins": 40,
-            "least_deviation": 1e-4,
-            "tolerance_per_point": 0.0,
-            "tolerance": 0.1,
-        },
+        "paper": _OTHERS | {"outliers": "none"},
+        "reference": _OTHERS | {"tolerance_per_point": 0.0, "tolerance": 0.1},
     }
 
     def __post_init__(self) -> None:
@@ -152,10 +142,7 @@ def select_elites(
 
 
 def within_workspace(
-    poses: Poses,
-    problem: RegistrationProblem,
-    space: SearchSpace,
-    margin: float | None,
+    poses: Poses, problem: RegistrationProblem, space: SearchSpace, margin: float | None
 ) -> BoolArray:
     """True (B,) where the object's origin is in the workspace, widened by a margin in metres.
 

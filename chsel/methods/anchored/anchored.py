@@ -153,15 +153,15 @@ class RatedPoses(NamedTuple):
 
 
 class Anchored(ConfiguredMethod[AnchoredSettings]):
-    """Samples anchored on contacts, fitted, spread below a limit, and a diverse choice of them."""
+    """Samples anchored on contacts, fitted, spread below a limit, and a diverse choice of them.
+
+    Costs are energies, nats.
+    """
 
     settings_class = AnchoredSettings
 
-    def register(
-        self, problem: RegistrationProblem, observer: Observer | None = None
-    ) -> Hypotheses:
-        """Hypotheses for the known points of a problem, best first; costs are energies, nats."""
-        search = Search(problem, self.settings, observer or NullObserver())
+    def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
+        search = Search(problem, self.settings, observer)
         return search.hypotheses(search.spread(search.minima()))
 
     def minima(self, problem: RegistrationProblem) -> Poses:
@@ -177,8 +177,7 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
         Those with an energy below the limit, beside the best hypothesis, where errors that points
         may share cost nothing.
         """
-        settings = self.settings
-        search = Search(problem, settings, NullObserver())
+        settings, search = self.settings, Search(problem, self.settings, NullObserver())
         energy = search.energy.by(noise_model(settings.noise, settings.shared_error))
         best = energy.of(Poses.of(hypotheses.object_from_world[:1]))
         return energy.of(Poses.of(object_from_world)) <= best[0] + settings.limit
