@@ -174,7 +174,14 @@ def _with_modes(
 
 
 def _filled(members: PlausibleSet, cost: EvaluationCost, limit: float) -> PlausibleSet:
-    """With members off the grid around others, if there are too few, or too few in its modes."""
+    """With members off the grid around others, if there are too few, or too few in its modes.
+
+    Rounds of normal steps in position and rotation vector from members, those of earlier rounds
+    among them, so that the search walks along the set; the steps get shorter after a round
+    without a new member, and in a thin set, where the first rounds give too few, after one with
+    few. Those are taken that are the farthest from each other and from the members. They show how
+    far the set reaches around its known members, not where else it has any.
+    """
     settings, around = members.settings, members.world_from_object
     wanted = settings.fill_to - len(around)
     if wanted <= 0:
@@ -183,34 +190,11 @@ def _filled(members: PlausibleSet, cost: EvaluationCost, limit: float) -> Plausi
         wanted = min((_PER_MODE - 1) * len(around), settings.fill_to - len(around), left)
     if wanted <= 0:
         return members
-    return members.with_members(*local_members(cost, around, limit, wanted, seed=members.seed))
-
-
-def random_subset(count: int, most: int, stream: np.random.Generator) -> IntArray:
-    """At most so many of the numbers below `count`, drawn at random, ascending."""
-    if count <= most:
-        return np.arange(count)
-    drawn = uniforms(stream, 0.0, 1.0, count)
-    return np.sort(np.argsort(drawn, kind="stable")[:most])
-
-
-def local_members(
-    cost: EvaluationCost, members: FloatArray, limit: float, wanted: int, *, seed: int
-) -> tuple[FloatArray, FloatArray]:
-    """Up to `wanted` poses (W, 4, 4) near members (P, 4, 4), world_from_object, and their costs.
-
-    Rounds of normal steps in position and rotation vector from members, those of earlier rounds
-    among them, so that the search walks along the set; the steps get shorter after a round
-    without a new member, and in a thin set, where the first rounds give too few, after one with
-    few. Of all that cost less than the limit, those are taken that are the farthest from each
-    other and from the members. They show how far the set reaches around its known members, not
-    where else it has any.
-    """
-    known, pool, costs, scale = len(members), members, np.zeros(0), 1.0
+    known, pool, costs, scale = len(around), around, np.zeros(0), 1.0
     for n in range(_MOST_ROUNDS):
         if n == _ROUNDS and len(costs) >= wanted:
             break
-        stream = plausible_stream(seed, 2 + n)
+        stream = plausible_stream(members.seed, 2 + n)
         steps = normals(stream, (_DRAWN, 6)) * scale
         starts = pool[np.floor(uniforms(stream, 0.0, float(len(pool)), _DRAWN)).astype(int)]
         drawn = stepped(starts, _POSITION * steps[:, :3], _ANGLE * steps[:, 3:])
@@ -224,7 +208,15 @@ def local_members(
             break
     places = _places(pool, cost.problem.sdf)
     chosen = np.sort(farthest_points(places, known + wanted, given=known))[known:]
-    return pool[chosen], costs[chosen - known]
+    return members.with_members(pool[chosen], costs[chosen - known])
+
+
+def random_subset(count: int, most: int, stream: np.random.Generator) -> IntArray:
+    """At most so many of the numbers below `count`, drawn at random, ascending."""
+    if count <= most:
+        return np.arange(count)
+    drawn = uniforms(stream, 0.0, 1.0, count)
+    return np.sort(np.argsort(drawn, kind="stable")[:most])
 
 
 def stepped(poses: FloatArray, shifts: FloatArray, turns: FloatArray) -> FloatArray:
@@ -237,10 +229,7 @@ def stepped(poses: FloatArray, shifts: FloatArray, turns: FloatArray) -> FloatAr
 
 
 def _places(poses: FloatArray, sdf: SdfGrid) -> FloatArray:
-    """Vectors (N, 12) whose distances compare poses (N, 4, 4): position, and scaled rotation.
-
-    A radian counts for about as far as it moves the surface of the object.
-    """
+    """Vectors (N, 12) whose distances compare poses (N, 4, 4): position, and scaled rotation."""
     lever = sdf.diameter / 4.0
     return np.concatenate([poses[:, :3, 3], lever * poses[:, :3, :3].reshape(-1, 9)], axis=1)
 

@@ -117,9 +117,8 @@ def mega_iterations(landscape, archive, search, random, first, last):
         objective = -cost_and_gradient_of(model, space, theta, gradient, work)
         measures_of(space, measure, theta, measures)
         measure_gradients_of(space, measure, theta, measure_gradients)
-        keep_better(
-            archive, cell_for(archive, objective, theta, measures), objective, theta, measures
-        )
+        cell = cell_for(archive, objective, theta, measures)
+        keep_better(archive, cell, objective, theta, measures)
         _normalise(gradient, -1.0, directions[0])
         for i in range(len(measures)):
             _normalise(measure_gradients[i], 1.0, directions[i + 1])
@@ -131,7 +130,8 @@ def mega_iterations(landscape, archive, search, random, first, last):
         tell(strategy, coefficients, branches.order, parents)
         if parents == 0 or stopped(strategy, branches.order, branches.status, branches.value):
             _move_to_elite(archive, random.elites[iteration], theta)
-            _forget(search.adam)
+            search.adam.moments[:] = 0.0
+            search.adam.powers[:] = 1.0
             reset(strategy)
             strategy.mean[:] = 0.0
         else:
@@ -178,9 +178,7 @@ def _normalise(gradient: FloatArray, sign: float, out: FloatArray) -> None:
 
 
 @inner
-def _branch(
-    theta: FloatArray, directions: FloatArray, coefficients: FloatArray, out: FloatArray
-) -> None:
+def _branch(theta, directions, coefficients, out):
     """Fill out (L, d) with theta + sum_i c_i g_i: coefficients c (L, n), directions g (n, d)."""
     for b in range(len(out)):
         for j in range(len(theta)):
@@ -200,9 +198,7 @@ def _move_to_elite(archive: Cells, uniform: float, vector: FloatArray) -> None:
 
 
 @inner
-def _move_towards(
-    theta: FloatArray, branches: Batch, weights: FloatArray, parents: int, adam: Adam
-) -> None:
+def _move_towards(theta, branches, weights, parents, adam):
     """One step of Adam from theta to the weighted mean of the best branches, its parents."""
     vectors, order = branches.vectors, branches.order
     moments, powers = adam.moments, adam.powers
@@ -213,14 +209,6 @@ def _move_towards(
         for i in range(parents):
             towards += weights[i] * (vectors[order[i], j] - theta[j])
         theta[j] += adam_step(towards, moments, j, powers, adam.rate, adam.epsilon)
-
-
-@inner
-def _forget(adam: Adam) -> None:
-    """Start Adam again."""
-    for j in range(adam.moments.shape[1]):
-        adam.moments[0, j] = adam.moments[1, j] = 0.0
-    adam.powers[0] = adam.powers[1] = 1.0
 
 
 def mega_search(

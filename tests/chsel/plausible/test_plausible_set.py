@@ -384,7 +384,7 @@ def test_what_was_changed_after_it_was_written_is_refused(made: Made, tmp_path: 
         arrays = dict(archive)
     for name, value, message in [
         ("cost", arrays["cost"] * 2.0, "does not hold what was written"),
-        ("settings", np.array("{}"), "damaged or not a plausible set"),
+        ("settings", np.array("["), "damaged or not a plausible set"),
         ("cost", np.array([object()]), "damaged"),
     ]:
         np.savez(path.open("wb"), **{**arrays, name: value})
