@@ -117,7 +117,8 @@ def direct(particles: Any, scale: Any, median: Any) -> None:
             pair += 1
     square = scale * scale
     if median and count > 1:
-        particles.selected[:] = particles.squares
+        for pair in range(len(particles.squares)):
+            particles.selected[pair] = particles.squares[pair]
         square = _median(particles.selected) / (2.0 * log(count + 1.0))
     gamma = 1.0 / (2.0 * square + _LEAST)
     pair = 0

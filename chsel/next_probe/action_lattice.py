@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 
@@ -90,7 +90,7 @@ def forward_actions(
     def lattice(spacing: float) -> _Lattice:
         approach = _Approach(workspace, hand, rotation)
         places = approach.places(spacing)
-        return _Lattice(approach.poses(places, start), np.full(len(places), length))
+        return approach.poses(places, start), np.full(len(places), length)
 
     return straight_actions(settings, *_few_enough(settings, workspace, lattice))
 
@@ -110,8 +110,8 @@ def around_actions(settings: ActionSettings, workspace: Workspace, hand: HandSha
             start = approach.nearest - MARGIN - float(hand.bounds[1, 2])
             poses = approach.poses(places, start)
             length = approach.lengths(places, start)
-            parts.append(_Lattice(poses[length > 0.0], length[length > 0.0]))
-        return _Lattice(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+            parts.append((poses[length > 0.0], length[length > 0.0]))
+        return np.concatenate([part[0] for part in parts]), np.concatenate([p[1] for p in parts])
 
     return straight_actions(settings, *_few_enough(settings, workspace, lattice))
 
@@ -133,11 +133,8 @@ _AROUND = (
 )
 
 
-class _Lattice(NamedTuple):
-    """Starts (A, 4, 4), and how far the hand goes (A,), metres; 0 for those of no use."""
-
-    poses: FloatArray
-    length: FloatArray
+# Starts (A, 4, 4), and how far the hand goes (A,), metres.
+_Lattice = tuple[FloatArray, FloatArray]
 
 
 class _Approach:
@@ -218,17 +215,14 @@ def _few_enough(
     """The lattice at the spacing of the settings, or at the next coarser one that is allowed."""
     sides = np.sort(np.ptp(workspace.bounds, axis=0))
     # With any less, one face alone has more.
-    spacing = max(
-        settings.spacing,
-        float(sides[2]) / settings.most,
-        float(np.sqrt(sides[1] * sides[2] / (2.0 * settings.most))),
-    )
-    found = lattice(spacing)
-    while len(found.length) > settings.most and spacing < 2.0 * sides[2]:
+    face = float(np.sqrt(sides[1] * sides[2] / (2.0 * settings.most)))
+    spacing = max(settings.spacing, float(sides[2]) / settings.most, face)
+    poses, length = lattice(spacing)
+    while len(length) > settings.most and spacing < 2.0 * sides[2]:
         spacing *= _COARSER
-        found = lattice(spacing)
-    chosen = evenly_spaced(len(found.length), settings.most)
-    return _Lattice(found.poses[chosen], found.length[chosen])
+        poses, length = lattice(spacing)
+    chosen = evenly_spaced(len(length), settings.most)
+    return poses[chosen], length[chosen]
 
 
 def _way_within(reach: ReachBall, poses: FloatArray) -> FloatArray:

@@ -242,15 +242,10 @@ def _nearly_plausible(grid: PoseGrid, cost: EvaluationCost, members: PlausibleSe
     """
     settings = members.settings.modes
     assert settings is not None
-    relaxed = EvaluationCost(
-        cost.problem,
-        replace(
-            cost.settings,
-            combine="means",
-            violation=_PENALTY * max(len(cost.problem.points.free), 1),
-            tolerance=cost.settings.tolerance + settings.depth,
-        ),
-    )
+    violation = _PENALTY * max(len(cost.problem.points.free), 1)
+    tolerance = cost.settings.tolerance + settings.depth
+    changes = replace(cost.settings, combine="means", violation=violation, tolerance=tolerance)
+    relaxed = EvaluationCost(cost.problem, changes)
     limit = relaxed.at(members.truth) + settings.distance
     most = max(1, MOST_MEMBERS // len(grid.positions))
     poses, count, first, size = [], 0, 0, min(_FIRST_ROTATIONS, most)

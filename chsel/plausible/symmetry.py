@@ -82,7 +82,18 @@ def object_symmetry(mesh: trimesh.Trimesh) -> ObjectSymmetry:
     """
     key = mesh_digest(mesh)
     if key not in _FOUND:
-        _FOUND[key] = _symmetry(RotatedSurface(mesh))
+        surface = RotatedSurface(mesh)
+        axes = _axes_of_revolution(surface) if surface.radius > 0.0 else np.zeros((0, 3))
+        if len(axes) > 1:
+            found = ObjectSymmetry(surface.centre, sphere=True)
+        elif len(axes) == 1:
+            half_turn = _half_turn_across(surface, axes[0])
+            found = ObjectSymmetry(surface.centre, half_turn, axes[0])
+        elif surface.radius > 0.0:
+            found = ObjectSymmetry(surface.centre, _finite_group(surface))
+        else:
+            found = ObjectSymmetry(surface.centre)
+        _FOUND[key] = found
     return _FOUND[key]
 
 
@@ -91,26 +102,13 @@ def grid_symmetry(sdf: SdfGrid) -> ObjectSymmetry:
     return ObjectSymmetry(object_centre(sdf) if has_surface(sdf) else sdf.bounds.mean(axis=0))
 
 
-def _symmetry(surface: RotatedSurface) -> ObjectSymmetry:
-    if surface.radius == 0.0:
-        return ObjectSymmetry(surface.centre)
-    axes = _axes_of_revolution(surface)
-    if len(axes) > 1:
-        return ObjectSymmetry(surface.centre, sphere=True)
-    if len(axes) == 1:
-        return ObjectSymmetry(surface.centre, _half_turn_across(surface, axes[0]), axes[0])
-    return ObjectSymmetry(surface.centre, _finite_group(surface))
-
-
 class RotatedSurface:
     """The surface of a mesh about its centroid, at unit radius.
 
     A rotation matches if the root mean square distance from the surface, of points of it that are
     rotated, is at most 0.85 % of the diameter, which is twice the distance from the centroid to the
-    farthest vertex. Scans of boxes, cans and bottles that are symmetric by design have up to
-    0.66 %. A tapered can turned upside down has 1.14 %, its scan 1.26 %, and a hammer rotated by
-    half a turn about its handle 1.16 %: a limit for scans that are distorted more would accept
-    these.
+    farthest vertex: scans of objects that are symmetric by design have up to 0.66 %, a tapered can
+    turned upside down has 1.14 %.
     """
 
     centre: FloatArray  # (3,), the surface's centroid in the frame of the mesh, m

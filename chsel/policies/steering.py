@@ -57,17 +57,9 @@ class Steering:
         ChselError if the policy, of another package, gives something else than a decision.
         """
         key = StreamKey(self.seed, done)
-        problem = DecisionProblem(
-            self.sdf,
-            points,
-            self.workspace,
-            self.free_resolution,
-            self.belief(points, hypotheses, key),
-            self.actions,
-            available,
-            self.hand,
-            key,
-        )
+        known = self.sdf, points, self.workspace, self.free_resolution
+        belief = self.belief(points, hypotheses, key)
+        problem = DecisionProblem(*known, belief, self.actions, available, self.hand, key)
         decision = self.policy.decide(problem)
         _check(problem, decision)
         self.last = Choice(problem, decision)

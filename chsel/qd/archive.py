@@ -124,11 +124,10 @@ def insert(archive: Cells, batch: Batch) -> None:
     cells, status, value = batch.cells, batch.status, batch.value
     for i in range(len(objectives)):
         cells[i] = cell_for(archive, objectives[i], vectors[i], measures[i])
-        status[i], value[i] = 0, -np.inf
-        if cells[i] < 0:
-            continue
         old = archive.objectives[cells[i]]
-        if old == -np.inf:
+        if cells[i] < 0:
+            status[i], value[i] = 0, -np.inf
+        elif old == -np.inf:
             status[i], value[i] = 2, objectives[i]
         else:
             status[i], value[i] = int(objectives[i] > old), objectives[i] - old

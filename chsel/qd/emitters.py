@@ -69,13 +69,6 @@ class Landscape(NamedTuple):
     work: Any  # scratch
 
 
-class RandomNumbers(NamedTuple):
-    """Random numbers of some iterations."""
-
-    normals: FloatArray  # (iterations, L, n), standard normal, for the strategy
-    elites: FloatArray  # (iterations,), uniform, each chooses an elite for a restart
-
-
 class Adam(NamedTuple):
     """State of Adam, see adam_step."""
 
@@ -107,8 +100,12 @@ class MeSearch(NamedTuple):
 
 
 @compiled
-def mega_iterations(landscape, archive, search, random, first, last):
-    """Iterations of CMA-MEGA (Fontaine and Nikolaidis, 2021) from `first` to before `last`."""
+def mega_iterations(landscape, archive, search, normals, elites, first, last):
+    """Iterations of CMA-MEGA (Fontaine and Nikolaidis, 2021) from `first` to before `last`.
+
+    normals: (iterations, L, n) for the strategy. elites: (iterations,) in [0, 1), each of which
+    chooses an elite for a restart.
+    """
     model, space, measure, work = landscape
     theta, measures, gradient = search.theta, search.measures, search.gradient
     measure_gradients, directions = search.measure_gradients, search.directions
@@ -122,14 +119,14 @@ def mega_iterations(landscape, archive, search, random, first, last):
         _normalise(gradient, -1.0, directions[0])
         for i in range(len(measures)):
             _normalise(measure_gradients[i], 1.0, directions[i + 1])
-        ask(strategy, random.normals[iteration], coefficients)
+        ask(strategy, normals[iteration], coefficients)
         _branch(theta, directions, coefficients, branches.vectors)
         _evaluate(landscape, branches)
         insert(archive, branches)
         parents = rank(branches.status, branches.value, branches.order)
         tell(strategy, coefficients, branches.order, parents)
         if parents == 0 or stopped(strategy, branches.order, branches.status, branches.value):
-            _move_to_elite(archive, random.elites[iteration], theta)
+            _move_to_elite(archive, elites[iteration], theta)
             search.adam.moments[:] = 0.0
             search.adam.powers[:] = 1.0
             reset(strategy)
@@ -139,17 +136,17 @@ def mega_iterations(landscape, archive, search, random, first, last):
 
 
 @compiled
-def me_iterations(landscape, archive, search, random, first, last):
-    """Iterations of CMA-ME (Fontaine et al., 2020) from `first` to before `last`."""
+def me_iterations(landscape, archive, search, normals, elites, first, last):
+    """The same of CMA-ME (Fontaine et al., 2020)."""
     samples, strategy = search.samples, search.strategy
     for iteration in range(first, last):
-        ask(strategy, random.normals[iteration], samples.vectors)
+        ask(strategy, normals[iteration], samples.vectors)
         _evaluate(landscape, samples)
         insert(archive, samples)
         parents = rank(samples.status, samples.value, samples.order)
         tell(strategy, samples.vectors, samples.order, parents)
         if parents == 0 or stopped(strategy, samples.order, samples.status, samples.value):
-            _move_to_elite(archive, random.elites[iteration], strategy.mean)
+            _move_to_elite(archive, elites[iteration], strategy.mean)
             reset(strategy)
 
 
@@ -271,10 +268,10 @@ def fill_archive(
     observer.snapshot(archive.snapshot(0, refinement))
     for begin in range(0, total, _TRACED):
         end = min(begin + _TRACED, total)
-        random = RandomNumbers(normals(stream, (end - begin, batch, dimension)), elites[begin:end])
+        random = normals(stream, (end - begin, batch, dimension)), elites[begin:end]
         stops = [n for n in range(begin + 1, end) if n % interval == 0]
         for first, last in pairwise([begin, *stops, end]):
-            run(landscape, archive.cells, search, random, first - begin, last - begin)
+            run(landscape, archive.cells, search, *random, first - begin, last - begin)
             if last == end:
                 observer.trace(name, last, archive.solutions, archive.costs)
                 observer.progress(name, last, total)

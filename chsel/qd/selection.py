@@ -11,7 +11,6 @@ from chsel.errors import ChselError, require_at_most
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SearchSpace, origin_bounds
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.subset import evenly_spaced, representative_poses
@@ -130,7 +129,9 @@ def select_elites(
     good = order[costs[order] <= _limit(costs[order], settings, known_count)]
     if settings.choice == "representative" and len(good) > count and has_surface(problem.sdf):
         poses = elites[good]
-        chosen = representatives(problem.sdf, poses, count)
+        pool = evenly_spaced(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
+        most = min(count, _MOST_REPRESENTATIVE)
+        chosen = pool[representative_poses(problem.sdf, poses[pool], most)]
         others = np.setdiff1d(np.arange(len(poses)), chosen)
         others = others[evenly_spaced(len(others), count - len(chosen))]
         return good[np.sort(np.concatenate([chosen, others]))]
@@ -154,15 +155,6 @@ def within_workspace(
     lower, upper = origin_bounds(problem.workspace, space, margin)
     inside: BoolArray = np.all((poses.origins >= lower) & (poses.origins <= upper), axis=1)
     return inside if inside.any() else everywhere
-
-
-def representatives(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
-    """Which of poses to take, `count` at most, so that all are near to one; the first always is.
-
-    Of many poses, those to choose from are taken evenly.
-    """
-    pool = evenly_spaced(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
-    return pool[representative_poses(sdf, poses[pool], min(count, _MOST_REPRESENTATIVE))]
 
 
 def _limit(costs: FloatArray, settings: OutputSettings, known_count: int) -> float:

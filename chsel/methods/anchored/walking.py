@@ -82,12 +82,8 @@ def walked(
     floor: the energy that they come down to, or stay below, see walk_below. kept: states of each.
     """
     count, model, likelihood = len(poses), energy.model, energy.likelihood
-    chains = Chains(
-        np.array(poses.numbers),
-        np.array(energies),
-        np.zeros((count, kept, 12)),
-        np.full((count, kept), np.inf),
-    )
+    states = np.zeros((count, kept, 12)), np.full((count, kept), np.inf)
+    chains = Chains(np.array(poses.numbers), np.array(energies), *states)
 
     def own() -> tuple[Scratch, Any]:
         return energy.scratch(), scratch(_MOVES * _DRAWS + 16, dtype=np.float32)

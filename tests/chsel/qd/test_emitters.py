@@ -138,9 +138,8 @@ class Stepper:
 
     def step(self, kind: int) -> None:
         landscape = emitters.Landscape(Landscape(kind), 0, MEASURE.code, 0)
-        random = emitters.RandomNumbers(self._normals, self.elites)
-        span = self.iteration, self.iteration + 1
-        self._loop(landscape, self.archive.cells, self.search, random, *span)
+        random, span = (self._normals, self.elites), (self.iteration, self.iteration + 1)
+        self._loop(landscape, self.archive.cells, self.search, *random, *span)
         self.iteration += 1
 
 
