@@ -350,11 +350,7 @@ def _inside(sdf: SdfGrid, tolerance: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _free_voxels(problem: RegistrationProblem, reach: float) -> tuple[FloatArray, Any]:
-    """Centre (3,) of the first voxel, and which voxels (nx, ny, nz) have a free point.
-
-    Of free points at most `reach` metres beyond the workspace, where the object can be. With a
-    layer of empty voxels around; a single empty one if there are none, or too many.
-    """
+    """Centre (3,) of the first voxel, and which (nx, ny, nz) have a free point within `reach`."""
     free, side = problem.points.free, problem.free_resolution
     lower, upper = problem.workspace.bounds
     free = free[((free >= lower - reach) & (free <= upper + reach)).all(axis=1)]

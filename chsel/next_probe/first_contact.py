@@ -80,12 +80,8 @@ def first_contacts(
     groups = list(moves_by_orientation(actions))
 
     def scratch() -> _View:
-        return _View(
-            np.empty((size, size), dtype=np.int64),
-            np.empty((len(points), 3)),
-            np.empty((size, size + 1), dtype=np.int64),
-            np.empty(len(points), dtype=np.int64),
-        )
+        nearest, begin = np.empty((size, size), np.int64), np.empty((size, size + 1), np.int64)
+        return _View(nearest, np.empty(points.shape), begin, np.empty(len(points), np.int64))
 
     def run(first: int, last: int, view: _View) -> None:
         for moves in groups:
@@ -97,18 +93,18 @@ def first_contacts(
 
 def touched_points(sdf: SdfGrid) -> TouchedPoints:
     """Points on the object's surface that a hand can touch."""
-    return sdf.derived("touched", lambda: _touched_points(sdf))
 
+    def make() -> TouchedPoints:
+        stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
+        fine = surface_points(sdf, _FINE_POINTS, stream)
+        points = fine[farthest_points(fine[:_CANDIDATES], POINTS)]
+        owner = np.empty(len(fine), dtype=np.int64)
+        find_nearest(points, fine, owner)
+        order = np.argsort(owner, kind="stable")
+        first = np.searchsorted(owner[order], np.arange(len(points) + 1))
+        return TouchedPoints(points, np.ascontiguousarray(fine[order]), first)
 
-def _touched_points(sdf: SdfGrid) -> TouchedPoints:
-    stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
-    fine = surface_points(sdf, _FINE_POINTS, stream)
-    points = fine[farthest_points(fine[:_CANDIDATES], POINTS)]
-    owner = np.empty(len(fine), dtype=np.int64)
-    find_nearest(points, fine, owner)
-    order = np.argsort(owner, kind="stable")
-    first = np.searchsorted(owner[order], np.arange(len(points) + 1))
-    return TouchedPoints(points, np.ascontiguousarray(fine[order]), first)
+    return sdf.derived("touched", make)
 
 
 def moves_by_orientation(actions: Actions) -> Iterator[Moves]:

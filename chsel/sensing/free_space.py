@@ -259,9 +259,9 @@ def _walk(grid, a, b):
     enters, leaves = _clipped(az, dz, nz, enters, leaves)
     if enters >= leaves:
         return
-    i, far_i = _voxel(ax, dx, enters, nx), _voxel(ax, dx, leaves, nx)
-    j, far_j = _voxel(ay, dy, enters, ny), _voxel(ay, dy, leaves, ny)
-    k, far_k = _voxel(az, dz, enters, nz), _voxel(az, dz, leaves, nz)
+    i, far_i = _within(ax + enters * dx, nx), _within(ax + leaves * dx, nx)
+    j, far_j = _within(ay + enters * dy, ny), _within(ay + leaves * dy, ny)
+    k, far_k = _within(az + enters * dz, nz), _within(az + leaves * dz, nz)
     if leaves == 1.0:  # the end itself, without rounding
         far_i, far_j, far_k = _within(b[0], nx), _within(b[1], ny), _within(b[2], nz)
     step_i, face_i, left_i, inverse_x = _crossings(i, far_i, dx)
@@ -315,11 +315,6 @@ def _clipped(a, d, count, enters, leaves):
 
 
 @leaf
-def _voxel(a, d, at, count):
-    return _within(a + at * d, count)
-
-
-@leaf
 def _within(place, count):
     return min(max(floor(place), 0), count - 1)
 
@@ -345,8 +340,20 @@ def interior_lattice(
     import trimesh
 
     require_positive("spacing", spacing)
-    solids = [meshes] if isinstance(meshes, trimesh.Trimesh) else meshes
-    return np.concatenate([np.zeros((0, 3)), *(_inside(solid, spacing) for solid in solids)])
+    inside = [np.zeros((0, 3))]
+    for mesh in [meshes] if isinstance(meshes, trimesh.Trimesh) else meshes:
+        lower, upper = np.asarray(mesh.bounds, dtype=np.float64)
+        each_side = np.floor(0.5 * (upper - lower) / spacing)
+        count = float(np.prod(2.0 * each_side + 1.0))
+        if not count <= MOST_NODES:
+            raise SettingError(
+                f"spacing is {spacing:g} m, which makes {count:.3g} nodes in a solid; accepted: a "
+                f"spacing that makes at most {MOST_NODES:_}"
+            )
+        axes = np.meshgrid(*[np.arange(-n, n + 1.0) * spacing for n in each_side], indexing="ij")
+        nodes = 0.5 * (lower + upper) + np.stack(axes, -1).reshape(-1, 3)
+        inside.append(nodes[mesh_sdf(mesh, nodes)[0] < -_DEEPEST_ON_SURFACE])
+    return np.concatenate(inside)
 
 
 def poses_between(poses: FloatArray, *, step: float, radius: float) -> FloatArray:
@@ -380,20 +387,6 @@ def poses_between(poses: FloatArray, *, step: float, radius: float) -> FloatArra
     fraction = (part / np.repeat(pieces, pieces))[between]
     path[between] = interpolated(kept[start[between]], kept[start[between] + 1], fraction)
     return np.concatenate([path, kept[-1:]])
-
-
-def _inside(mesh: trimesh.Trimesh, spacing: float) -> FloatArray:
-    lower, upper = np.asarray(mesh.bounds, dtype=np.float64)
-    each_side = np.floor(0.5 * (upper - lower) / spacing)
-    count = float(np.prod(2.0 * each_side + 1.0))
-    if not count <= MOST_NODES:
-        raise SettingError(
-            f"spacing is {spacing:g} m, which makes {count:.3g} nodes in a solid; accepted: a "
-            f"spacing that makes at most {MOST_NODES:_}"
-        )
-    axes = [np.arange(-n, n + 1.0) * spacing for n in each_side]
-    nodes = 0.5 * (lower + upper) + np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    return nodes[mesh_sdf(mesh, nodes)[0] < -_DEEPEST_ON_SURFACE]
 
 
 def _motion(first: FloatArray, second: FloatArray, radius: float) -> FloatArray:

@@ -350,7 +350,9 @@ class Search:
         apart = squared_distances(sdf, candidates.poses[pool])
         energies = energies[pool]
         plausible = np.searchsorted(energies, energies + _REACH, side="right")
-        weights = coverage_weights(plausible)
+        # The chance of each to be drawn from the plausible set of a random true pose.
+        shares = np.bincount(plausible - 1, 1.0 / plausible, len(plausible))
+        weights = np.cumsum(shares[::-1])[::-1] / len(plausible)
         to_set = np.minimum.accumulate(apart, axis=1)[:, plausible - 1]
         prices = in_order(to_set) / (len(pool) * count)
         given = np.searchsorted(pool, modes)
@@ -360,12 +362,3 @@ class Search:
         vectors = self._space.encode(candidates.poses)
         self._observer.trace(stage, 0, vectors.copy(), candidates.energies.copy())
         self._observer.progress(stage, 1, 1)
-
-
-def coverage_weights(plausible: IntArray) -> FloatArray:
-    """The chance (C,) of each candidate to be drawn from the plausible set of a random true pose.
-
-    plausible (C,), rising: of each true pose, how many of the likeliest are plausible.
-    """
-    shares = np.bincount(plausible - 1, 1.0 / plausible, len(plausible))
-    return np.cumsum(shares[::-1])[::-1] / len(plausible)

@@ -12,7 +12,7 @@ import numpy as np
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_kernels import Model
 from chsel.cost.cost_settings import CostSettings
-from chsel.cost.free_kernels import is_apart, remember, travel
+from chsel.cost.free_kernels import is_apart, remember
 from chsel.numerics.arrays import FloatArray, scratch
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp, exps, log, logs
@@ -75,7 +75,7 @@ class Scratch(NamedTuple):
     """Of one thread."""
 
     near: NearPoints  # the free points gathered
-    memory: FloatArray  # (12,), where the object was then, see remember
+    memory: FloatArray  # (12,), where the object was then, see remember and travel
     sums: FloatArray  # (K,), of costs, then posterior weights
 
 
@@ -240,12 +240,6 @@ def gather_free(model, pose, slack, work):
         points.number[0] = 0
     else:
         gather(free.tree, free.cells, to_cell, slack + rounding, points, 0)
-
-
-@leaf
-def travel_since_gathering(model, pose, work):
-    """How far in the world any point of the object moved at most since then, metres."""
-    return travel(model.free, pose, work.memory)
 
 
 @leaf
