@@ -120,7 +120,7 @@ def scan_grid(cost: EvaluationCost, grid: PoseGrid, limit: float) -> tuple[IntAr
     scan = Scan(
         model=cost.model,
         bounds=_bounds(cost.problem.sdf, cost.settings.lookup),
-        is_farther=_is_farther(cost.problem.sdf, cost.settings.outside),
+        beyond=_beyond(cost.problem.sdf, cost.settings.outside),
         rotations=Poses.of(inverse(compose(grid.rotations, np.zeros(3)))).numbers,
         positions=grid.positions,
         known=points.known[order].T.copy(),
@@ -183,14 +183,16 @@ def _bounds(sdf: SdfGrid, lookup: str) -> FloatArray:
     return np.stack([least - rounding, greatest + rounding]).reshape(2, -1)
 
 
-def _is_farther(sdf: SdfGrid, outside: str) -> bool:
-    """Whether the surface is at least as far from a point beyond the grid as the grid's box is.
+def _beyond(sdf: SdfGrid, outside: str) -> tuple[float, float]:
+    """Weights of d^2 and s^2 in the least squared distance beyond the grid.
 
-    With gradients that point out of the box it is; with others, the way may be of any length.
+    d: to its box; s: what its nearest point reads. With gradients that point out of the box, the
+    way to the surface is at least as long as both together; with others, it may be of any length.
     """
     ends = [(axis, end, sign) for axis in range(3) for end, sign in ((0, -1.0), (-1, 1.0))]
     faces = [sign * np.take(sdf.gradients[..., axis], end, axis=axis) for axis, end, sign in ends]
-    return outside == "bounding_box" or min(face.min() for face in faces) > _LEAST_OUTWARD
+    outward = float(min(face.min() for face in faces) > _LEAST_OUTWARD)
+    return (1.0, 0.0) if outside == "bounding_box" else (outward, outward)
 
 
 class Scan(NamedTuple):
@@ -198,7 +200,7 @@ class Scan(NamedTuple):
 
     model: EvaluationModel
     bounds: FloatArray  # (2, nodes), see _bounds
-    is_farther: bool  # see _is_farther
+    beyond: tuple[float, float]  # see _beyond
     rotations: FloatArray  # (R, 12), object_from_world, of poses at the origin
     positions: FloatArray  # (P, 3), world
     known: FloatArray  # (3, M), world, the most informative first
@@ -287,12 +289,13 @@ def _add_bounds(scan: Scan, buffer: ScanBuffer, start: int, m: int) -> None:
         e = node_of((e - first[1]) * inverse, box.between, most[1])
         f = node_of((f - first[2]) * inverse, box.between, most[2])
         cell[i] = np.int32(d * box.across + e * box.along + f)
-    value = scan.known_sdf[m]
+    value, weights = scan.known_sdf[m], scan.beyond
     for i in range(_LANES):
         at = np.uint64(cell[i])
         least, greatest = bounds[0, at], bounds[1, at]
         inside = max(least - value, value - greatest)
-        outside = np.sqrt(beyond[i]) - value if scan.is_farther else 0.0
+        least = max(least, 0.0)
+        outside = np.sqrt(weights[0] * beyond[i] + weights[1] * (least * least)) - value
         total[i] += max(outside if beyond[i] > 0.0 else inside, 0.0)
 
 
