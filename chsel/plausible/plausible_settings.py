@@ -21,7 +21,6 @@ from chsel.problem.settings import (
     positive,
     settings_mapping,
 )
-from chsel.problem.streams import StreamKey
 
 DEFINITIONS = ("default", "paper", "reference", "wide_means", "wide_means_10mm", "wide_sums")
 MOST_POSITIONS = 100_000
@@ -81,16 +80,6 @@ class PoseGridSettings(CheckedSettings):
     extra: Annotated[str, one_of("added", "replaced", "none")] = "added"
     seed: int | None = None  # of the rotations; by default that of the session
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.extra == "replaced" and self.rotations <= self.upright:
-            raise SettingError(
-                f"rotations is {self.rotations}; accepted: more than the {self.upright} upright "
-                "ones that replace some of them"
-            )
-        if self.seed is not None:
-            StreamKey(self.seed, 0)
-
 
 @dataclass(frozen=True)
 class ModeSearchSettings(CheckedSettings):
@@ -118,11 +107,6 @@ class PlausibleSettings(CheckedSettings):
     # With fewer members on the grid, others are sought around them; 0: never.
     fill_to: Annotated[int, not_negative] = 30
     modes: ModeSearchSettings | None = None  # how to look for members far from all on the grid
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.fill_to > self.members:
-            raise SettingError(f"fill_to is {self.fill_to}; accepted: at most members")
 
     @property
     def text(self) -> str:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from chsel.errors import EvaluationError, PoseError, SettingError
+from chsel.errors import EvaluationError, PoseError
 from chsel.numerics.arrays import FloatArray, IntArray, frozen
 from chsel.numerics.cell_set import node_of
 from chsel.numerics.compiler import compiled, leaf
@@ -313,14 +313,6 @@ class TruePoseSettings(CheckedSettings):
     angle: Annotated[float, positive] = 0.02  # standard deviation of these rotations, radians
     passes: Annotated[int, positive, at_most(10)] = 2
     cost: EvaluationCostSettings = field(default_factory=EvaluationCostSettings)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.reach / self.spacing > 20.0:
-            raise SettingError(
-                f"spacing is {self.spacing} with reach {self.reach}; accepted: at least a "
-                "twentieth of it"
-            )
 
 
 class TruePose(NamedTuple):

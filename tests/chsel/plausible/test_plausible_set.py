@@ -295,10 +295,8 @@ def plausible_rotation(by: PlausibleSettings, seed: int) -> FloatArray:
     ("make", "message"),
     [
         (lambda: PlausibleSettings(epsilon=0.0), "epsilon is 0.0"),
-        (lambda: PlausibleSettings(fill_to=50, members=40), "fill_to is 50"),
         (lambda: Offsets(z=((0.0, 0.1, 0),)), "offsets are .15, 15, 0. along x, y and z"),
         (lambda: Offsets(z=((0.0, 0.1, 10**6),)), "the number of offsets"),
-        (lambda: PoseGridSettings(rotations=50, extra="replaced"), "rotations is 50"),
         (lambda: EvaluationCostSettings("medians"), "combine is 'medians'"),
         (lambda: plausible_settings("mine", 0.001), "'mine'"),
     ],
