@@ -59,7 +59,6 @@ def warm_up_sensing() -> None:
     depth, mask = np.full((3, 4), 0.05), np.ones((3, 4), dtype=bool)
     occlusion_edges(depth, mask, 0.1)
     grid.from_depth(depth, camera, np.eye(4), mask)
-    grid.scaled_images(depth, camera, np.eye(4), mask)
     grid.along_rays(np.zeros(3), np.ones((1, 3)))
     grid.at(np.zeros((1, 3)))
 

@@ -125,7 +125,6 @@ def _rows(
     """A row of numbers for every step with a set; what went wrong at the others."""
     rows: list[Row] = []
     failures: list[str] = []
-    before: PlausibleSet | None = None
     metrics = HypothesisMetrics(config.metrics, source.mesh, truth)
     waiting = Console(stderr=True)
     with Progress(console=waiting, transient=True, disable=not waiting.is_terminal) as progress:
@@ -136,12 +135,11 @@ def _rows(
             again = found is None
             if found is None:
                 try:
-                    found = plausible_set(problem, truth, settings, survivors=before)
+                    found = plausible_set(problem, truth, settings)
                 except EvaluationError as error:
                     failures.append(f"step {step}: {error}")
                     continue
                 save_plausible(folder, found)
-            before = found
             row = _row(problem, found, time.perf_counter() - begun if again else "found")
             rows.append(row | metrics.compute(problem, found, source.problems.found(step)))
     return rows, failures

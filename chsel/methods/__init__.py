@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from chsel.errors import require_choice
-from chsel.methods.anchored.anchored import Anchored
-from chsel.methods.anchored.anchored_settings import AnchoredSettings
+from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
 from chsel.methods.chsel import Chsel, ChselSettings
 from chsel.methods.cvo import Cvo, CvoSettings
 from chsel.methods.gradient_descent import GradientDescent, GradientDescentSettings

@@ -76,8 +76,7 @@ def _replace_worst(keys, key):
 def _locate(grid, pose, contacts, nodes, beyond):
     """Fill in the nodes (A,) nearest to contacts (3, A), and how far these are out of the grid.
 
-    A loop of its own: without lookups, and with min and max outside of tuples, the compiler makes
-    vector instructions of it, which halves the time of all samples.
+    The compiler makes vector instructions of it, as it has no lookups.
     """
     step = np.float32(1.0) / grid.inverse / np.float32(UNIT)
     for n in range(len(nodes)):

@@ -14,7 +14,6 @@ from typing import Annotated, Any
 import numpy as np
 
 from chsel.cost.cost_settings import uncertain_depth
-from chsel.errors import SettingError
 from chsel.methods.anchor_kernels import NO_POSE, UNIT, Box32, CoarseScore, keep_best
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import bounds_of, set_voxels
@@ -63,14 +62,6 @@ class AnchorSettings(CheckedSettings):
     pairs: Annotated[float, not_negative] = 0.5  # share with two surface points on a pair's line
     contacts: Annotated[float, not_negative] = 0.4  # share with one surface point on a contact
     margin: Annotated[float, not_negative] = 0.15  # of the workspace for object origins, metres
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.pairs + self.contacts > 1.0:
-            raise SettingError(
-                f"pairs and contacts are {self.pairs} and {self.contacts}; accepted: shares whose "
-                "sum is at most 1"
-            )
 
 
 @dataclass(frozen=True)
@@ -157,13 +148,7 @@ class AnchorSampler:
         self._frames = _in_32_bits(_frames(contacts[contact_pairs] - middle).T)  # (12, pairs)
 
     def best(
-        self,
-        samples: int,
-        most: int,
-        *,
-        index: int = 0,
-        tolerance: float = 0.0,
-        left_out: int = 0,
+        self, samples: int, most: int, *, index: int = 0, tolerance: float = 0.0, left_out: int = 0
     ) -> Poses:
         """The best of so many random poses by their coarse score: K poses, best first.
 
@@ -245,11 +230,8 @@ class AnchorSampler:
         first, count = self._contact_spans.take(contact, axis=1)
         at = self._surface_order[first + _chosen(shares[1], count)]
         outward = self._values[contact] * self._normals.take(at, axis=1)
-        met, contacts = (
-            self._surface.take(at, axis=1) + outward,
-            self._contacts.take(contact, axis=1),
-        )
-        return self._poses(self._rotations(shares), contacts, met)
+        met = self._surface.take(at, axis=1) + outward
+        return self._poses(self._rotations(shares), self._contacts.take(contact, axis=1), met)
 
     def _anywhere(self, shares: Any) -> Any:
         """Poses that put the object's origin anywhere in its bounds."""
@@ -368,11 +350,7 @@ def _inside(sdf: SdfGrid, tolerance: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _free_voxels(problem: RegistrationProblem, reach: float) -> tuple[FloatArray, Any]:
-    """Centre (3,) of the first voxel, and which voxels (nx, ny, nz) have a free point.
-
-    Of free points at most `reach` metres beyond the workspace, where the object can be. With a
-    layer of empty voxels around; a single empty one if there are none, or too many.
-    """
+    """Centre (3,) of the first voxel, and which (nx, ny, nz) have a free point within `reach`."""
     free, side = problem.points.free, problem.free_resolution
     lower, upper = problem.workspace.bounds
     free = free[((free >= lower - reach) & (free <= upper + reach)).all(axis=1)]

@@ -26,7 +26,6 @@ from chsel.qd.measures import measure_named
 from chsel.qd.selection import (
     ArchiveSettings,
     OutputSettings,
-    measure_range,
     ranked_hypotheses,
     select_elites,
     sized_archive,
@@ -35,8 +34,6 @@ from chsel.qd.selection import (
 
 MOST_PASSES = 10_000
 _BEST = 0.2  # of the estimates: those that the next pass starts around
-
-
 # Most starts end in minima that nobody asks for: many, of which few go on.
 _DESCENT = DescentSettings(restarts=5, stop_below=None, race=(1.0, 0.5, 0.25))
 _EMITTER = EmitterSettings(iterations=30)
@@ -69,10 +66,6 @@ class ChselSettings(CheckedSettings):
             "emitter": {"iterations": 100},
         },
     }
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        measure_named(self.archive.measure, planar=self.plane is not None)
 
 
 class Chsel(ConfiguredMethod[ChselSettings]):
@@ -110,9 +103,8 @@ class _Algorithm1:
         # 2: P <- m(E')
         estimates = evaluated(objective, measure, vectors, costs)
         # 3: mu, sigma <- mean and standard deviation of P
-        mean, deviation = measure_range(estimates, measure, settings, known_count)
         # 4: M <- grid with dimensions mu +- b_sigma sigma
-        archive = sized_archive(measure, mean, deviation, settings, space.dimension)
+        archive = sized_archive(estimates, measure, settings, known_count, space.dimension)
         # 5: M <- UpdateCells(M, E' and E_l)
         archive.update_cells(estimates, evaluated(objective, measure, space.encode(low_cost_set)))
         # 6: M <- CMA-MEGA(M, C^, n_o)
@@ -135,17 +127,9 @@ class _Algorithm1:
         settings, start = self.settings.emitter, archive.best_solution
         if settings.start == "initial":
             start = self.space.encode(initial_set[:1])[0]
-        fill_archive(
-            self.settings.search,
-            self.objective,
-            archive,
-            start,
-            len(initial_set),
-            settings,
-            self.problem.key,
-            self.observer,
-            index,
-        )
+        key, count = self.problem.key, len(initial_set)
+        search = self.settings.search, self.objective, archive, start, count, settings
+        fill_archive(*search, key, self.observer, index)
 
     def lowest_cost_cells(self, archive: GridArchive, index: int) -> Hypotheses:
         """Line 7."""

@@ -17,12 +17,7 @@ from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
-from chsel.problem.registration_problem import (
-    Hypotheses,
-    NullObserver,
-    Observer,
-    RegistrationProblem,
-)
+from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, positive
 from chsel.qd.selection import ranked_hypotheses
@@ -50,8 +45,6 @@ class DescentSettings(CheckedSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_at_most("restarts x iterations", self.restarts * self.iterations, MOST_ITERATIONS)
-        if self.stop_below is not None and not np.isfinite(self.stop_below):
-            raise SettingError(f"stop_below is {self.stop_below}; accepted: a number, or null")
         shares = self.race or (0.0,)
         falling = all(share <= before for before, share in pairwise((1.0, *shares)))
         if self.race is not None and not (falling and shares[-1] > 0.0):
@@ -78,7 +71,7 @@ def descend(
     vectors = space.encode(starts)
     costs = objective.costs(vectors)
     running = np.arange(len(starts))
-    _show(observer, 0, vectors, costs)
+    observer.trace("descent", 0, vectors.copy(), costs.copy())
     for block in range(settings.restarts):
         lowest = np.argsort(costs[running], kind="stable")
         running = np.sort(running[lowest[: settings.runners(block, len(starts))]])
@@ -90,16 +83,11 @@ def descend(
         gain = np.where(before > 0.0, (before - after) / np.where(before > 0.0, before, 1.0), 0.0)
         vectors[running], costs[running] = moved, after
         done = (block + 1) * settings.iterations
-        _show(observer, done, vectors, costs)
+        observer.trace("descent", done, vectors.copy(), costs.copy())
         observer.progress("descent", done, total)
         if settings.stop_below is not None and float(gain.mean()) <= settings.stop_below:
             break
     return space.poses(vectors), costs
-
-
-def _show(observer: Observer, iteration: int, vectors: FloatArray, costs: FloatArray) -> None:
-    if type(observer) is not NullObserver:
-        observer.trace("descent", iteration, vectors.copy(), costs.copy())
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
-from chsel.errors import SettingError
 from chsel.methods.method import ConfiguredMethod
-from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.eigen import decompose
 from chsel.numerics.pose_tuples import finite, moved, pose_at, turned
@@ -39,20 +38,13 @@ class IcpSettings(CheckedSettings):
     redraw: Annotated[str, one_of("registration", "session")] = "session"
     iterations: Annotated[int, not_negative, at_most(MOST_ITERATIONS)] = 100  # at most
     # End when the rms distance of no start falls by more than this fraction; None: never early.
-    stop_below: float | None = 1e-6
+    stop_below: Annotated[float | None, not_negative, at_most(1.0)] = 1e-6
     online: OnlineSettings = field(default_factory=OnlineSettings)
 
     presets: ClassVar[Presets] = {
         "paper": {"surface_points": 500, "redraw": "registration"},
         "reference": {"surface_points": 500},
     }
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.stop_below is not None and not 0.0 <= self.stop_below < 1.0:
-            raise SettingError(
-                f"stop_below is {self.stop_below}; accepted: from 0 to less than 1, or null"
-            )
 
 
 class Icp(ConfiguredMethod[IcpSettings]):
@@ -69,7 +61,7 @@ class Icp(ConfiguredMethod[IcpSettings]):
         contacts, poses = problem.points.contacts, Poses.of(problem.initial_set)
         if len(contacts) == 0:
             return ranked(problem.initial_set, np.zeros(len(poses)))
-        sets = _PointSets(contacts.T.copy(), self.surface(problem).T.copy())
+        sets = contacts.T.copy(), self.surface(problem).T.copy()
         observer.trace("icp", 0, poses.vectors, _distances(sets, poses))
         poses = self._iterated(sets, poses, observer)
         return ranked(poses.matrices, _distances(sets, poses))
@@ -92,7 +84,10 @@ class Icp(ConfiguredMethod[IcpSettings]):
             history, after = np.empty((count, len(poses), 12)), np.empty((count, len(poses)))
             run = partial(_iterate, sets, poses.numbers, history, after)
             parallel_for(run, len(poses), scratch)
-            falling = self._falling(np.concatenate([errors[None], after]))
+            falling = np.ones(count, dtype=bool)  # whether any start's error falls enough
+            if self.settings.stop_below is not None:
+                before = np.concatenate([errors[None], after[:-1]])
+                falling = (after < (1.0 - self.settings.stop_below) * before).any(axis=1)
             count = count if falling.all() else int(np.argmin(falling)) + 1
             poses, errors = Poses(history[count - 1]), after[count - 1]
             observer.trace("icp", first + count, poses.vectors, errors.copy())
@@ -101,19 +96,9 @@ class Icp(ConfiguredMethod[IcpSettings]):
                 break
         return poses
 
-    def _falling(self, errors: FloatArray) -> BoolArray:
-        """Whether any start's error falls enough in each of K iterations; errors (K + 1, B)."""
-        if self.settings.stop_below is None:
-            return np.ones(len(errors) - 1, dtype=bool)
-        falls: BoolArray = errors[1:] < (1.0 - self.settings.stop_below) * errors[:-1]
-        return np.logical_or.reduce(falls, axis=1)
 
-
-class _PointSets(NamedTuple):
-    """The points that are aligned."""
-
-    contacts: FloatArray  # (3, N), world, metres
-    surface: FloatArray  # (3, Q), object frame, metres
+# Contacts (3, N), world, and points (3, Q) of the surface, object frame, that they are put onto.
+_PointSets = tuple[FloatArray, FloatArray]
 
 
 def _distances(sets: _PointSets, poses: Poses) -> FloatArray:
@@ -140,7 +125,7 @@ class _Scratch(NamedTuple):
 
 
 def _scratch(sets: _PointSets) -> _Scratch:
-    count = sets.contacts.shape[1]
+    count = sets[0].shape[1]
     points, matched = np.empty((2, 3, count))
     nearest = np.empty(count, dtype=np.int64)
     return _Scratch(
@@ -150,12 +135,7 @@ def _scratch(sets: _PointSets) -> _Scratch:
 
 @compiled
 def _iterate(sets, poses, history, errors, first, last, scratch):
-    """Run K iterations from poses (B, 12), those from `first` to before `last`.
-
-    Fills history (K, B, 12), the pose after each iteration, and errors (K, B): the rms distance of
-    the contacts to the points matched with them, infinite once a sum is not finite; the pose stays
-    then.
-    """
+    """Fill history (K, B, 12) with poses after each of K iterations, and errors (K, B), metres."""
     for n in range(first, last):
         pose = pose_at(poses, n)
         error, settled = np.inf, False
@@ -163,8 +143,8 @@ def _iterate(sets, poses, history, errors, first, last, scratch):
             if not settled:  # a pose that stays as it is will always do so
                 before = pose
                 _match(sets, pose, scratch)
-                pose = _aligned(sets.contacts, pose, scratch)
-                error = _rms(sets.contacts, pose, scratch.matched)
+                pose = _aligned(sets[0], pose, scratch)
+                error = _rms(sets[0], pose, scratch.matched)
                 settled = pose == before
             for i in range(12):
                 history[k, n, i] = pose[i]
@@ -173,17 +153,16 @@ def _iterate(sets, poses, history, errors, first, last, scratch):
 
 @compiled
 def _fill_distances(sets, poses, out, first, last, scratch):
-    """Fill out (B,) with the rms distances under poses (B, 12), from `first` to before `last`."""
     for n in range(first, last):
         pose = pose_at(poses, n)
         _match(sets, pose, scratch)
-        out[n] = _rms(sets.contacts, pose, scratch.matched)
+        out[n] = _rms(sets[0], pose, scratch.matched)
 
 
 @inner
 def _match(sets, pose, scratch):
     """Fill matched (3, N) with the surface point nearest to each contact, the first of equals."""
-    contacts, surface = sets.contacts, sets.surface
+    contacts, surface = sets
     squares, nearest = scratch.squares, scratch.nearest
     xs, ys, zs = scratch.points[0], scratch.points[1], scratch.points[2]
     for n in range(len(squares)):
@@ -204,11 +183,7 @@ def _match(sets, pose, scratch):
 
 @inner
 def _aligned(points, pose, scratch):
-    """The pose that brings points (3, N) nearest to those matched (Horn, 1987, Sec. 4).
-
-    Its rotation is the unit quaternion of largest q^T M q. Where that leaves some freedom, as with
-    one point or with points in a line, it is the one nearest to the rotation of `pose`.
-    """
+    """The pose that brings points (3, N) nearest to those matched (Horn, 1987, Sec. 4)."""
     matched = scratch.matched
     x, y, z = _centre(points)
     u, v, w = _centre(matched)

@@ -29,14 +29,13 @@ from chsel.problem.sdf_lookup import DistanceField, distance_field, distance_in_
 from chsel.problem.search_space import PlaneSettings, SE3Space, SearchSpace, search_space
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, normals
-from chsel.qd.archive import Batch, GridArchive, batch_of, evaluated, rank
+from chsel.qd.archive import Batch, batch_of, evaluated, rank
 from chsel.qd.emitters import EmitterSettings, fill_archive
 from chsel.qd.evolution_kernels import Strategy, ask, stopped, strategy_around, tell
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import (
     ArchiveSettings,
     OutputSettings,
-    measure_range,
     ranked_hypotheses,
     select_elites,
     sized_archive,
@@ -53,15 +52,11 @@ _TOLERANCE = 2e-3  # half sides, by which a ball may stick out of the one that h
 _POSES_PER_THREAD = 100  # fewer are costed faster than a thread wakes up
 
 
-@dataclass(frozen=True, eq=False)
-class Balls:
+class Balls(NamedTuple):
     """Balls in the world."""
 
     centres: FloatArray  # (N_b, 3), metres
     radii: FloatArray  # (N_b,), metres
-
-    def __len__(self) -> int:
-        return len(self.radii)
 
 
 def medial_balls(
@@ -94,19 +89,14 @@ def medial_balls(
 
 
 def _is_medial(squared: IntArray) -> BoolArray:
-    """Flags (nx, ny, nz) of voxels of the set whose ball is in the ball of no neighbour.
-
-    squared (nx, ny, nz): squared clearances, 0 outside of the set and on the outermost layer. Ball
-    u holds ball v if |c_u - c_v| + r_v <= r_u.
-    """
+    """Flags (nx, ny, nz) of voxels, of squared clearances, whose ball is in no neighbour's."""
     inner = squared[1:-1, 1:-1, 1:-1]
     radii, medial = np.sqrt(squared.astype(np.float64)), np.zeros(squared.shape, dtype=np.bool_)
     own, kept = radii[1:-1, 1:-1, 1:-1], inner > 0
     for offset in np.ndindex(3, 3, 3):
         apart = 2.0 * math.sqrt(sum((step - 1) ** 2 for step in offset))
-        around = tuple(
-            slice(step, step + side) for step, side in zip(offset, inner.shape, strict=True)
-        )
+        sides = zip(offset, inner.shape, strict=True)
+        around = tuple(slice(step, step + side) for step, side in sides)
         if apart > 0.0:
             kept &= (apart + own > radii[around] + _TOLERANCE) | (squared[around] <= inner)
     medial[1:-1, 1:-1, 1:-1] = kept
@@ -115,10 +105,7 @@ def _is_medial(squared: IntArray) -> BoolArray:
 
 @compiled
 def _covering(voxels: IntArray, radii: FloatArray, inflation: float) -> IntArray:
-    """Indices of balls that, inflated, cover all others: each the next that is not yet covered.
-
-    voxels (P, 3) with radii (P,). Ball i covers ball j if |c_i - c_j| + r_j <= r_i + inflation.
-    """
+    """Indices of balls that, inflated, cover all others: each the next that is not yet covered."""
     covered, chosen = np.zeros(len(radii), dtype=np.bool_), np.empty(len(radii), dtype=np.int64)
     count = 0
     for i in range(len(radii)):
@@ -220,7 +207,6 @@ class MedialCost:
 
 @compiled
 def _fill_costs(model, poses, out, first, last, places):
-    """Fill out (B,) with the costs of poses (B, 12), from `first` to before `last`."""
     for n in range(first, last):
         out[n] = _cost(model, pose_at(poses, n), places)
 
@@ -328,8 +314,7 @@ def evolved(
 ) -> FloatArray:
     """Search vectors (B, d) of the estimates that CMA-ES finds from E_0."""
     vectors = objective.space.encode(initial_set)
-    starts = vectors[:1] if settings.starts == "single" else vectors
-    runs = run_all(objective, starts, len(vectors), settings, key, observer)
+    runs = run_all(objective, vectors, settings, key, observer)
     if settings.starts == "per_start":
         return np.stack([run.best for run in runs])
     samples = np.empty(vectors.shape)
@@ -337,20 +322,22 @@ def evolved(
     return samples
 
 
+@compiled
+def _draw(strategy: Strategy, normals: FloatArray, samples: FloatArray) -> None:
+    ask(strategy, normals, samples)
+
+
 def run_all(
     objective: MedialCost,
-    starts: FloatArray,
-    count: int,
+    vectors: FloatArray,
     settings: CmaEsSettings,
     key: StreamKey,
     observer: Observer,
 ) -> list[Run]:
-    """A run from each of the starts (S, d), all to their ends, block by block.
-
-    count: how many hypotheses are wanted.
-    """
-    dimension = starts.shape[1]
-    size = settings.size(dimension, count)
+    """A run from each of vectors (B, d), or from the first, all to their ends, block by block."""
+    starts = vectors[:1] if settings.starts == "single" else vectors
+    dimension = vectors.shape[1]
+    size = settings.size(dimension, len(vectors))
     total = settings.most_generations(dimension, size)
     runs = [
         Run(
@@ -418,12 +405,6 @@ def evolve(
         run.ended[0] = is_level or stopped(strategy, order, batch.status, value)
 
 
-@compiled
-def _draw(strategy: Strategy, normals: FloatArray, samples: FloatArray) -> None:
-    """Fill samples (S, d) of a strategy's distribution from normals (S, d)."""
-    ask(strategy, normals, samples)
-
-
 @dataclass(frozen=True)
 class MedialConstraintSettings:
     """All settings of Medial Constraint."""
@@ -451,13 +432,10 @@ class MedialConstraint(ConfiguredMethod[MedialConstraintSettings]):
 
 
 TOLERANCE = 1e-5  # m^2, of a mean square: that of 3 mm
-
-_ARCHIVE = ArchiveSettings(
-    measure="position_2", bins=40, tolerance_per_point=0.0, tolerance=TOLERANCE
-)
+_ARCHIVE = ArchiveSettings("position_2", 40, tolerance_per_point=0.0, tolerance=TOLERANCE)
 _EMITTER = EmitterSettings(iterations=500, sigma0=1.0, rate=0.05)
 _OUTPUT = OutputSettings(
-    choice="lowest", ratio=5.0, tolerance_per_point=0.0, free_tolerance=TOLERANCE, margin=None
+    "lowest", ratio=5.0, tolerance_per_point=0.0, free_tolerance=TOLERANCE, margin=None
 )
 
 
@@ -480,9 +458,6 @@ class MedialConstraintCmaMeSettings:
         "reference": {},
     }
 
-    def __post_init__(self) -> None:
-        measure_named(self.archive.measure, planar=self.plane is not None)
-
 
 class MedialConstraintCmaMe(ConfiguredMethod[MedialConstraintCmaMeSettings]):
     """CMA-ES from E_0, then CMA-ME over an archive around what it finds; costs are in m^2."""
@@ -490,15 +465,19 @@ class MedialConstraintCmaMe(ConfiguredMethod[MedialConstraintCmaMeSettings]):
     settings_class = MedialConstraintCmaMeSettings
 
     def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
-        settings = self.settings
-        space = search_space(settings.plane, problem.sdf)
+        settings, key, count = self.settings, problem.key, len(problem.initial_set)
+        space, grid = search_space(settings.plane, problem.sdf), settings.archive
         objective = MedialCost(problem, settings.cost, space=space)
-        key, count = problem.key, len(problem.initial_set)
+        measure = measure_named(grid.measure, planar=settings.plane is not None)
         # E' <- CMA-ES on E_0; as poses, so that it holds what hypotheses can be
         initial_set = Poses.of(problem.initial_set)
         vectors = evolved(objective, initial_set, settings.cma_es, key, observer)
-        vectors = space.encode(space.poses(vectors))
-        archive = self._seeded_archive(problem, objective, vectors)
+        estimates = evaluated(objective, measure, space.encode(space.poses(vectors)))
+        # M <- the archive that measures of E' size, holding E' and E_l
+        known = len(problem.points.known)
+        archive = sized_archive(estimates, measure, grid, known, space.dimension)
+        low_cost_set = space.encode(Poses.of(problem.low_cost_set))
+        archive.update_cells(estimates, evaluated(objective, measure, low_cost_set))
         # M <- CMA-ME(M, C_M, n_o)
         first, best = space.encode(initial_set[:1])[0], archive.best_solution
         start = first if settings.emitter.start == "initial" else best
@@ -507,18 +486,6 @@ class MedialConstraintCmaMe(ConfiguredMethod[MedialConstraintCmaMeSettings]):
         stream, elites = key.stream(Purpose.RESAMPLE), space.poses(archive.solutions)
         chosen = select_elites(archive.costs, elites, problem, space, settings.output, stream)
         snapshot = archive.snapshot(settings.emitter.iterations, 0)
-        cells = archive.occupied[chosen]
-        return ranked_hypotheses(objective, elites[chosen], cells, elites, snapshot)
-
-    def _seeded_archive(
-        self, problem: RegistrationProblem, objective: MedialCost, vectors: FloatArray
-    ) -> GridArchive:
-        """The archive that measures of E', vectors (B, d), size, holding E' and E_l."""
-        settings, space = self.settings.archive, objective.space
-        measure = measure_named(settings.measure, planar=self.settings.plane is not None)
-        estimates = evaluated(objective, measure, vectors)
-        mean, deviation = measure_range(estimates, measure, settings, len(problem.points.known))
-        archive = sized_archive(measure, mean, deviation, settings, space.dimension)
-        low_cost_set = space.encode(Poses.of(problem.low_cost_set))
-        archive.update_cells(estimates, evaluated(objective, measure, low_cost_set))
-        return archive
+        return ranked_hypotheses(
+            objective, elites[chosen], archive.occupied[chosen], elites, snapshot
+        )

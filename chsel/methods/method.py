@@ -30,22 +30,11 @@ class Method(Protocol):
         """Hypotheses, best first. The observer sees intermediate results and changes nothing."""
 
 
-class MethodSettings(Protocol):
-    """Settings of a method with those of Algorithm 2 in their field `online`."""
-
-    @property
-    def online(self) -> OnlineSettings:
-        """How a session makes the next problem."""
-
-
-Settings = TypeVar("Settings", bound=MethodSettings)
+Settings = TypeVar("Settings", bound=Any)
 
 
 class ConfiguredMethod(Generic[Settings]):
-    """Base of a method whose settings have a field `online`; `settings_class` makes the default.
-
-    A method has `_hypotheses`, or a `register` of its own.
-    """
+    """Base of a method whose settings have a field `online`; `settings_class` makes the default."""
 
     settings_class: type[Settings]
 
@@ -55,7 +44,8 @@ class ConfiguredMethod(Generic[Settings]):
     @property
     def online(self) -> OnlineSettings:
         """How a session makes the next problem for this method."""
-        return self.settings.online
+        online: OnlineSettings = self.settings.online
+        return online
 
     def register(
         self, problem: RegistrationProblem, observer: Observer | None = None

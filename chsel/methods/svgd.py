@@ -47,16 +47,9 @@ class Particles(NamedTuple):
 def particles_at(vectors: FloatArray) -> Particles:
     """Particles at search vectors (B, d), which are copied."""
     count, dimension = vectors.shape
-    pairs = count * (count - 1) // 2
-    return Particles(
-        vectors=np.array(vectors, dtype=np.float64),
-        moments=np.zeros((count, 2, dimension)),
-        powers=np.ones(2),
-        scores=np.zeros((count, dimension)),
-        directions=np.zeros((count, dimension)),
-        squares=np.zeros(pairs),
-        selected=np.zeros(pairs),
-    )
+    moments, pairs = np.zeros((count, 2, dimension)), np.zeros((2, count * (count - 1) // 2))
+    scores, directions = np.zeros((2, count, dimension))
+    return Particles(vectors.copy(), moments, np.ones(2), scores, directions, *pairs)
 
 
 class SteinStep(NamedTuple):
@@ -114,7 +107,14 @@ def direct(particles: Any, scale: Any, median: Any) -> None:
     """
     vectors, scores, directions = particles.vectors, particles.scores, particles.directions
     count, dimension = vectors.shape
-    _measure(vectors, particles.squares)
+    pair = 0
+    for i in range(count):
+        for j in range(i):
+            total = 0.0
+            for d in range(dimension):
+                total += (vectors[i, d] - vectors[j, d]) * (vectors[i, d] - vectors[j, d])
+            particles.squares[pair] = total
+            pair += 1
     square = scale * scale
     if median and count > 1:
         for pair in range(len(particles.squares)):
@@ -137,19 +137,6 @@ def direct(particles: Any, scale: Any, median: Any) -> None:
     for i in range(count):
         for d in range(dimension):
             directions[i, d] /= count
-
-
-@inner
-def _measure(vectors: Any, squares: Any) -> None:
-    """Fill squares with the squared distances of vectors (B, d), by i, then by j < i."""
-    pair = 0
-    for i in range(len(vectors)):
-        for j in range(i):
-            total = 0.0
-            for d in range(vectors.shape[1]):
-                total += (vectors[i, d] - vectors[j, d]) * (vectors[i, d] - vectors[j, d])
-            squares[pair] = total
-            pair += 1
 
 
 @inner
@@ -206,17 +193,11 @@ class Svgd(ConfiguredMethod[SvgdSettings]):
         require_at_most("number of poses in E_0", len(problem.initial_set), MOST_PARTICLES)
         space = search_space(self.settings.plane, problem.sdf)
         objective = Objective(CompiledCost.of(problem, self.settings.cost), space)
-        starts = space.encode(Poses.of(problem.initial_set))
-        vectors = self._moved(objective, starts, observer)
-        estimates = space.poses(vectors)
-        return ranked_hypotheses(objective, estimates, elites=estimates)
-
-    def _moved(self, objective: Objective, vectors: FloatArray, observer: Observer) -> FloatArray:
-        """Search vectors (B, d) after all iterations."""
         settings, total = self.settings, self.settings.iterations
         median = settings.kernel == "median"
         step = SteinStep(settings.sharpness, settings.scale, median, settings.rate)
-        particles = particles_at(vectors)
+        particles = particles_at(space.encode(Poses.of(problem.initial_set)))
+        vectors = particles.vectors
         # Scratch in which particles remember their neighbours, if it is not too large.
         size = len(vectors) * objective.model.free.tree.points.shape[1]
         remembered = len(vectors) if size <= _MOST_REMEMBERED else LANES
@@ -224,9 +205,8 @@ class Svgd(ConfiguredMethod[SvgdSettings]):
         observer.trace("svgd", 0, vectors.copy(), objective.costs(vectors))
         for first in range(0, total, _BLOCK):
             last = min(first + _BLOCK, total)
-            space = objective.space_arrays
-            svgd(objective.model, space, particles, around, step, last - first)
-            moved = particles.vectors
-            observer.trace("svgd", last, moved.copy(), objective.costs(moved))
+            svgd(objective.model, space.arrays, particles, around, step, last - first)
+            observer.trace("svgd", last, vectors.copy(), objective.costs(vectors))
             observer.progress("svgd", last, total)
-        return particles.vectors
+        estimates = space.poses(vectors)
+        return ranked_hypotheses(objective, estimates, elites=estimates)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from chsel.errors import SettingError
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Workspace
-from chsel.problem.poses import compose
+from chsel.problem.poses import compose, rotated
 from chsel.problem.settings import CheckedSettings, at_most, not_negative, one_of, positive
 from chsel.problem.subset import evenly_spaced
 
@@ -90,7 +90,7 @@ def forward_actions(
     def lattice(spacing: float) -> _Lattice:
         approach = _Approach(workspace, hand, rotation)
         places = approach.places(spacing)
-        return _Lattice(approach.poses(places, start), np.full(len(places), length))
+        return approach.poses(places, start), np.full(len(places), length)
 
     return straight_actions(settings, *_few_enough(settings, workspace, lattice))
 
@@ -109,10 +109,9 @@ def around_actions(settings: ActionSettings, workspace: Workspace, hand: HandSha
             places = approach.places(spacing, shift)
             start = approach.nearest - MARGIN - float(hand.bounds[1, 2])
             poses = approach.poses(places, start)
-            parts.append(_Lattice(poses, approach.lengths(places, start)))
-        joined = _Lattice(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-        kept = joined.length > 0.0
-        return _Lattice(joined.poses[kept], joined.length[kept])
+            length = approach.lengths(places, start)
+            parts.append((poses[length > 0.0], length[length > 0.0]))
+        return np.concatenate([part[0] for part in parts]), np.concatenate([p[1] for p in parts])
 
     return straight_actions(settings, *_few_enough(settings, workspace, lattice))
 
@@ -134,11 +133,8 @@ _AROUND = (
 )
 
 
-class _Lattice(NamedTuple):
-    """Starts (A, 4, 4), and how far the hand goes (A,), metres; 0 for those of no use."""
-
-    poses: FloatArray
-    length: FloatArray
+# Starts (A, 4, 4), and how far the hand goes (A,), metres.
+_Lattice = tuple[FloatArray, FloatArray]
 
 
 class _Approach:
@@ -158,9 +154,9 @@ class _Approach:
         self._direction = rotation[:, 2]
         choices = np.array(list(np.ndindex(2, 2, 2)))
         corners = self._box[choices, np.arange(3)]  # (8, 3)
-        self._spans = _times(corners, self._axes)  # (8, 2)
-        self.nearest = float(_times(corners, self._direction[None]).min())
-        self._lowest = float(_times(hand.vertices, rotation[2:]).min())  # of the hand, from its z
+        self._spans = rotated(self._axes, corners)  # (8, 2)
+        self.nearest = float(rotated(self._direction[None], corners).min())
+        self._lowest = float(rotated(rotation[2:], hand.vertices).min())  # of the hand, from its z
         self._front = float(hand.bounds[1, 2])
 
     def places(self, spacing: float, shift: float = 0.0) -> FloatArray:
@@ -219,17 +215,14 @@ def _few_enough(
     """The lattice at the spacing of the settings, or at the next coarser one that is allowed."""
     sides = np.sort(np.ptp(workspace.bounds, axis=0))
     # With any less, one face alone has more.
-    spacing = max(
-        settings.spacing,
-        float(sides[2]) / settings.most,
-        float(np.sqrt(sides[1] * sides[2] / (2.0 * settings.most))),
-    )
-    found = lattice(spacing)
-    while len(found.length) > settings.most and spacing < 2.0 * sides[2]:
+    face = float(np.sqrt(sides[1] * sides[2] / (2.0 * settings.most)))
+    spacing = max(settings.spacing, float(sides[2]) / settings.most, face)
+    poses, length = lattice(spacing)
+    while len(length) > settings.most and spacing < 2.0 * sides[2]:
         spacing *= _COARSER
-        found = lattice(spacing)
-    chosen = evenly_spaced(len(found.length), settings.most)
-    return _Lattice(found.poses[chosen], found.length[chosen])
+        poses, length = lattice(spacing)
+    chosen = evenly_spaced(len(length), settings.most)
+    return poses[chosen], length[chosen]
 
 
 def _way_within(reach: ReachBall, poses: FloatArray) -> FloatArray:
@@ -239,8 +232,3 @@ def _way_within(reach: ReachBall, poses: FloatArray) -> FloatArray:
     inside = reach.radius * reach.radius - (offset * offset).sum(axis=1)
     way = np.sqrt(np.maximum(along * along + inside, 0.0)) - along
     return np.where(inside >= 0.0, way, -1.0)
-
-
-def _times(points: FloatArray, axes: FloatArray) -> FloatArray:
-    """Coordinates (N, D) of points (N, 3) along axes (D, 3)."""
-    return (points[:, None] * axes).sum(axis=2)

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
 
 CELL = 0.002  # metres: side of the cells of the front
-_LARGEST = 2000  # cells, either way: a hand of 4 m
-MOST_ACTIONS = 20_000  # that are compared in one decision
+_LARGEST = 2.0  # metres from its origin that a hand reaches
 STOPS = ("", "spread", "gain", "actions", "budget")
 """Why no further probe is made: the set is small, no action promises to make it smaller, there is
 none left that can be taken, or as many were made as were allowed. "" if one is made."""
@@ -40,7 +39,7 @@ class HandShape:
     """The surface of a hand in its own frame, metres; it probes along its z axis.
 
     vertices (V, 3), faces (F, 3): triangles of one or more closed bodies.
-    Raises SettingError for a hand without a face, or one of more than 4 m.
+    Raises SettingError for a hand without a face, or one that reaches more than 2 m.
     """
 
     def __init__(self, vertices: Any, faces: Any) -> None:
@@ -50,11 +49,10 @@ class HandShape:
         )
         if len(self.faces) == 0 or self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
             raise SettingError("the hand has no faces between its vertices; accepted: a mesh")
-        sides = np.ptp(self.vertices[:, :2], axis=0)
-        if (sides > CELL * (_LARGEST - 2)).any():
+        farthest = float(np.abs(self.vertices).max())
+        if farthest > _LARGEST:
             raise SettingError(
-                f"the hand is {sides.max():.3g} m wide; accepted: at most "
-                f"{CELL * (_LARGEST - 2):.3g} m"
+                f"the hand reaches {farthest:.3g} m from its origin; accepted: up to {_LARGEST:g} m"
             )
 
     @classmethod
@@ -126,11 +124,7 @@ class Actions:
     seconds: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        poses = frozen("actions", self.world_from_hand, (None, 4, 4), error=PoseError)
-        check_rigid("actions", poses)
-        _check_near("actions", poses)
-        if len(poses) > MOST_ACTIONS:
-            raise SettingError(f"there are {len(poses)} actions; accepted: at most {MOST_ACTIONS}")
+        poses = _near_poses("actions", self.world_from_hand)
         object.__setattr__(self, "world_from_hand", poses)
         for name in ("length", "seconds"):
             value = getattr(self, name)
@@ -158,9 +152,7 @@ class Belief:
     weights: FloatArray  # (K,), not negative, of sum 1 but for rounding
 
     def __post_init__(self) -> None:
-        poses = frozen("belief", self.object_from_world, (None, 4, 4), error=PoseError)
-        check_rigid("belief", poses)
-        _check_near("belief", poses)
+        poses = _near_poses("belief", self.object_from_world)
         if len(poses) == 0:
             raise PoseError("the belief has no poses; accepted: at least one")
         weights = frozen("weights", self.weights, (len(poses),), error=SettingError)
@@ -194,11 +186,6 @@ class DecisionProblem:
 
     def __post_init__(self) -> None:
         require_positive("free_resolution", self.free_resolution)
-        farthest = float(np.abs(self.hand.bounds).max())
-        if farthest > FARTHEST:
-            raise SettingError(
-                f"the hand reaches {farthest:.3g} m from its origin; accepted: up to {FARTHEST:g} m"
-            )
         flags = frozen(
             "available", self.available, (len(self.actions),), dtype=np.bool_, error=SettingError
         )
@@ -243,10 +230,13 @@ class Decision:
         return digest(numbers, *arrays, self.contacts)
 
 
-def _check_near(name: str, transforms: FloatArray) -> None:
-    """Raise PoseError unless transforms (B, 4, 4) move by at most FARTHEST along each axis."""
-    far = np.abs(transforms[:, :3, 3]).max(axis=1) > FARTHEST
+def _near_poses(name: str, transforms: FloatArray) -> FloatArray:
+    """Rigid transforms (B, 4, 4); PoseError for others, or farther than FARTHEST along an axis."""
+    poses = frozen(name, transforms, (None, 4, 4), error=PoseError)
+    check_rigid(name, poses)
+    far = np.abs(poses[:, :3, 3]).max(axis=1, initial=0.0) > FARTHEST
     if far.any():
         raise PoseError(
             f"{name}[{int(np.argmax(far))}] is beyond {FARTHEST:g} m; accepted: places within"
         )
+    return poses

@@ -10,8 +10,9 @@ import numpy as np
 from chsel.next_probe.decision_problem import Actions, Belief, HandShape
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, inner, leaf
+from chsel.numerics.pose_tuples import turned, turned_back
 from chsel.numerics.threads import parallel_for
-from chsel.problem.poses import Poses
+from chsel.problem.poses import Poses, rotated
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.subset import farthest_points
@@ -79,12 +80,8 @@ def first_contacts(
     groups = list(moves_by_orientation(actions))
 
     def scratch() -> _View:
-        return _View(
-            np.empty((size, size), dtype=np.int64),
-            np.empty((len(points), 3)),
-            np.empty((size, size + 1), dtype=np.int64),
-            np.empty(len(points), dtype=np.int64),
-        )
+        nearest, begin = np.empty((size, size), np.int64), np.empty((size, size + 1), np.int64)
+        return _View(nearest, np.empty(points.shape), begin, np.empty(len(points), np.int64))
 
     def run(first: int, last: int, view: _View) -> None:
         for moves in groups:
@@ -96,18 +93,18 @@ def first_contacts(
 
 def touched_points(sdf: SdfGrid) -> TouchedPoints:
     """Points on the object's surface that a hand can touch."""
-    return sdf.derived("touched", lambda: _touched_points(sdf))
 
+    def make() -> TouchedPoints:
+        stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
+        fine = surface_points(sdf, _FINE_POINTS, stream)
+        points = fine[farthest_points(fine[:_CANDIDATES], POINTS)]
+        owner = np.empty(len(fine), dtype=np.int64)
+        find_nearest(points, fine, owner)
+        order = np.argsort(owner, kind="stable")
+        first = np.searchsorted(owner[order], np.arange(len(points) + 1))
+        return TouchedPoints(points, np.ascontiguousarray(fine[order]), first)
 
-def _touched_points(sdf: SdfGrid) -> TouchedPoints:
-    stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
-    fine = surface_points(sdf, _FINE_POINTS, stream)
-    points = fine[farthest_points(fine[:_CANDIDATES], POINTS)]
-    owner = np.empty(len(fine), dtype=np.int64)
-    find_nearest(points, fine, owner)
-    order = np.argsort(owner, kind="stable")
-    first = np.searchsorted(owner[order], np.arange(len(points) + 1))
-    return TouchedPoints(points, np.ascontiguousarray(fine[order]), first)
+    return sdf.derived("touched", make)
 
 
 def moves_by_orientation(actions: Actions) -> Iterator[Moves]:
@@ -119,11 +116,9 @@ def moves_by_orientation(actions: Actions) -> Iterator[Moves]:
         same = left & (rotations == rotations[first]).all(axis=(1, 2))
         which = np.flatnonzero(same)
         left &= ~same
-        turn = rotations[first].T
-        position = actions.world_from_hand[which, :3, 3]
-        starts = position[:, 0, None] * turn[:, 0]
-        starts = starts + position[:, 1, None] * turn[:, 1] + position[:, 2, None] * turn[:, 2]
-        yield Moves(np.ascontiguousarray(turn).reshape(-1), starts, actions.length[which], which)
+        turn = np.ascontiguousarray(rotations[first].T)
+        starts = rotated(turn, actions.world_from_hand[which, :3, 3])
+        yield Moves(turn.reshape(-1), starts, actions.length[which], which)
 
 
 @compiled
@@ -149,9 +144,9 @@ def meet(
     nx, ny = heights.shape
     seen, turn, fine = view.seen, moves.rotation, surface.fine
     width_x, width_y, per_side, per_cell = nx * side, ny * side, 1.0 / side, 1.0 / cell
-    best, hand_from_object = np.empty(3, dtype=np.int64), np.empty(12)
+    best = np.empty(3, dtype=np.int64)
     for k in range(some[0], some[1]):
-        _turn(turn, poses[k], hand_from_object)
+        hand_from_object = _hand_from_object(turn, poses[k])
         low_x, low_y = _look(surface.points, hand_from_object, view, cell)
         size = len(view.nearest)
         for a in range(len(moves.which)):
@@ -192,43 +187,28 @@ def meet(
             if least <= moves.length[a]:
                 column = moves.which[a]
                 travel[k, column] = least
-                for axis in range(3):
-                    contact[k, column, axis] = (
-                        turn[axis] * place[0] + turn[3 + axis] * place[1]
-                    ) + turn[6 + axis] * place[2]
+                x, y, z = turned_back(turn, place[0], place[1], place[2])
+                contact[k, column, 0], contact[k, column, 1], contact[k, column, 2] = x, y, z
 
 
-@inner
-def _turn(turn: Any, pose: Any, hand_from_object: Any) -> None:
-    """Fill (12,) with the rotation into axes of the hand, then the pose's translation.
-
-    turn (9,): hand_from_world. pose (12,): object_from_world, whose rotation is transposed.
-    """
-    for row in range(3):
-        for column in range(3):
-            hand_from_object[3 * row + column] = (
-                turn[3 * row] * pose[3 * column] + turn[3 * row + 1] * pose[3 * column + 1]
-            ) + turn[3 * row + 2] * pose[3 * column + 2]
-        hand_from_object[9 + row] = pose[9 + row]
+@leaf
+def _hand_from_object(turn: Any, pose: Any) -> Any:
+    """The rotation into axes of the hand, then the translation of a pose (12,)."""
+    a, d, g = turned(turn, pose[0], pose[1], pose[2])
+    b, e, h = turned(turn, pose[3], pose[4], pose[5])
+    c, f, i = turned(turn, pose[6], pose[7], pose[8])
+    return a, b, c, d, e, f, g, h, i, pose[9], pose[10], pose[11]
 
 
 @leaf
 def _turned(pose: Any, x: Any, y: Any, z: Any) -> Any:
     """A place of the object in axes of the hand."""
-    p, q, r = x - pose[9], y - pose[10], z - pose[11]
-    return (
-        pose[0] * p + pose[1] * q + pose[2] * r,
-        pose[3] * p + pose[4] * q + pose[5] * r,
-        pose[6] * p + pose[7] * q + pose[8] * r,
-    )
+    return turned(pose, x - pose[9], y - pose[10], z - pose[11])
 
 
 @inner
 def _look(points: Any, hand_from_object: Any, view: Any, cell: Any) -> Any:
-    """Turn the object into the axes of the hand, and order what is seen of it by cells.
-
-    Returns x and y of the first cell's corner.
-    """
+    """Order what the hand sees of the object by cells; x and y of the first cell's corner."""
     seen, nearest = view.seen, view.nearest
     size, per_cell = len(nearest), 1.0 / cell
     low_x, low_y = np.inf, np.inf

@@ -13,7 +13,7 @@ from chsel.next_probe.decision_problem import Belief, Decision, DecisionProblem
 from chsel.next_probe.first_contact import FirstContacts, first_contacts
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.compiler import compiled
-from chsel.numerics.elementary import exp, log
+from chsel.numerics.elementary import exp, exps, log, logs
 from chsel.numerics.threads import parallel_for
 from chsel.problem.outline import (
     in_order,
@@ -249,40 +249,18 @@ def surprise(
     noise, are as likely as each other; the chance of a place farther off falls like a Gaussian. 6.5
     is the most: no pose had forecast anything like it.
     """
-    met = contact is not None
-    place = np.zeros(3) if contact is None else np.array(contact, dtype=np.float64)
-    weights, contacts = np.array(problem.belief.weights), np.array(decision.contacts)
-    return float(_nats(weights, contacts, met, place, float(noise)))
-
-
-@compiled
-def _nats(weights: Any, contacts: Any, met: Any, place: Any, noise: Any) -> Any:
-    """`surprise` of forecast contacts (K, 3), NaN for a miss, and a place (3,)."""
-    hit, mean_x, mean_y, mean_z = 0.0, 0.0, 0.0, 0.0
-    for k in range(len(weights)):
-        if contacts[k, 0] == contacts[k, 0]:
-            hit += weights[k]
-            mean_x += weights[k] * contacts[k, 0]
-            mean_y += weights[k] * contacts[k, 1]
-            mean_z += weights[k] * contacts[k, 2]
-    scatter = 0.0
+    weights, forecast = problem.belief.weights, decision.contacts
+    hits = ~np.isnan(forecast[:, 0])
+    places = np.where(hits[:, None], forecast, 0.0)
+    hit, scatter = float(in_order(np.where(hits, weights, 0.0))), 0.0
     if hit > 0.0:
-        for k in range(len(weights)):
-            if contacts[k, 0] == contacts[k, 0]:
-                x = contacts[k, 0] - mean_x / hit
-                y = contacts[k, 1] - mean_y / hit
-                z = contacts[k, 2] - mean_z / hit
-                scatter += weights[k] / hit * (x * x + y * y + z * z)
+        away = places - in_order(weights * places.T) / hit
+        scatter = float(in_order(np.where(hits, weights / hit * in_order(away * away), 0.0)))
     scale = 1.0 / (4.0 * noise * noise + scatter)
-    chance = 0.0
-    for k in range(len(weights)):
-        likely = _WRONG
-        if met == (contacts[k, 0] == contacts[k, 0]):
-            likely = 1.0
-            if met:
-                x = contacts[k, 0] - place[0]
-                y = contacts[k, 1] - place[1]
-                z = contacts[k, 2] - place[2]
-                likely = max(_WRONG, exp(-scale * (x * x + y * y + z * z)))
-        chance += weights[k] * likely
-    return -log((1.0 - _NONE_OF_THESE) * chance + _NONE_OF_THESE * _ANY_OUTCOME)
+    likely = np.where(hits, _WRONG, 1.0)
+    if contact is not None:
+        away = places - contact
+        near = np.maximum(_WRONG, exps(-scale * in_order(away * away)))
+        likely = np.where(hits, near, _WRONG)
+    chance = float(in_order(weights * likely))
+    return -float(logs((1.0 - _NONE_OF_THESE) * chance + _NONE_OF_THESE * _ANY_OUTCOME))

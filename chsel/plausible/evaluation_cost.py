@@ -22,7 +22,7 @@ from chsel.numerics.near_points import (
 from chsel.numerics.pose_tuples import finite, pose_at, rigid, turned_back
 from chsel.numerics.threads import parallel_for, require_ieee_arithmetic
 from chsel.plausible.plausible_settings import EvaluationCostSettings
-from chsel.problem.points import KnownPoints, Lattice, VoxelGrid, voxels_spanned
+from chsel.problem.points import voxels_spanned
 from chsel.problem.poses import Poses, inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
@@ -80,6 +80,8 @@ class EvaluationCost:
         require_ieee_arithmetic()
         self.problem, self.settings = problem, settings
         points, sdf, level = problem.points, problem.sdf, -settings.tolerance
+        counts = len(points.free), len(points.occupied), len(points.known)
+        divided = settings.combine == "means"
         tree = point_tree(points.free, problem.free_resolution)
         voxels, point_in = _voxels(tree, problem.free_resolution)
         occupied = points.occupied if settings.occupied else np.zeros((0, 3))
@@ -92,7 +94,7 @@ class EvaluationCost:
             known_sdf=points.sdf.copy(),
             level=level,
             violation=settings.violation,
-            divisors=_divisors(points, settings),
+            divisors=Divisors(*(float(max(n, 1)) if divided else 1.0 for n in counts)),
             inside=sdf.derived(("inside", level), lambda: _inside(sdf, level)),
             voxels=voxels,
             point_in=point_in,
@@ -111,13 +113,6 @@ class EvaluationCost:
         return float(self.evaluate(inverse(world_from_object)[None])[0])
 
 
-def _divisors(points: KnownPoints, settings: EvaluationCostSettings) -> Divisors:
-    if settings.combine == "sums":
-        return Divisors(1.0, 1.0, 1.0)
-    classes = points.free, points.occupied, points.known
-    return Divisors(*(float(max(len(part), 1)) for part in classes))
-
-
 def _inside(sdf: SdfGrid, level: float) -> FloatArray:
     """Points (3, I) inside of the object, far apart from each other."""
     nodes = np.argwhere(sdf.values <= level)
@@ -131,11 +126,11 @@ def _voxels(tree: PointTree, resolution: float) -> tuple[Box, Any]:
     free = tree.points.T
     if len(free) == 0 or voxels_spanned(free, resolution) > _MOST_VOXELS:
         return box_of(np.zeros(3), 1.0, (1, 1, 1)), np.full(1, -1, dtype=np.int32)
-    grid = VoxelGrid.around(free, resolution)
-    point_in = np.full(grid.flags.shape, -1, dtype=np.int32)
-    voxels = Lattice(tuple(grid.origin.tolist()), resolution).voxels(free)
-    point_in[tuple(np.clip(voxels, 0, np.array(grid.flags.shape) - 1).T)] = np.arange(len(free))
-    return box_of(grid.origin, resolution, grid.flags.shape), point_in.reshape(-1)
+    first = free.min(axis=0) - resolution
+    voxels = np.rint((free - first) / resolution).astype(np.int64)
+    point_in = np.full(voxels.max(axis=0) + 2, -1, dtype=np.int32)
+    point_in[tuple(voxels.T)] = np.arange(len(free))
+    return box_of(first, resolution, point_in.shape), point_in.reshape(-1)
 
 
 class EvaluationScratch(NamedTuple):
@@ -190,23 +185,20 @@ def _cost(model: EvaluationModel, free: int, occupied: int, total: float) -> flo
 @spliced
 def _known_sum(model: EvaluationModel, pose: Pose, scratch: EvaluationScratch) -> float:
     """sum |s - v| over the points of known signed distance, in their order."""
-    known, total = model.known, 0.0
-    locate(pose, model.field.box, known[0], known[1], known[2], scratch.places, known.shape[1])
-    for n in range(known.shape[1]):
-        x, y, z = known[0, n], known[1, n], known[2, n]
-        s = distance_in_place(model.field, pose, x, y, z, scratch.places, n)[0]
+    xs, ys, zs, total = model.known[0], model.known[1], model.known[2], 0.0
+    locate(pose, model.field.box, xs, ys, zs, scratch.places, len(xs))
+    for n in range(len(xs)):
+        s = distance_in_place(model.field, pose, xs[n], ys[n], zs[n], scratch.places, n)[0]
         total += abs(s - model.known_sdf[n])
     return total
 
 
 @spliced
 def _occupied_count(model: EvaluationModel, pose: Pose, scratch: EvaluationScratch) -> int:
-    occupied, count = model.occupied, 0
-    places, number = scratch.places, occupied.shape[1]
-    locate(pose, model.field.box, occupied[0], occupied[1], occupied[2], places, number)
-    for n in range(number):
-        x, y, z = occupied[0, n], occupied[1, n], occupied[2, n]
-        s = distance_in_place(model.field, pose, x, y, z, places, n)[0]
+    xs, ys, zs, count = model.occupied[0], model.occupied[1], model.occupied[2], 0
+    locate(pose, model.field.box, xs, ys, zs, scratch.places, len(xs))
+    for n in range(len(xs)):
+        s = distance_in_place(model.field, pose, xs[n], ys[n], zs[n], scratch.places, n)[0]
         count += 1 if s >= -model.level else 0
     return count
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
@@ -20,7 +21,6 @@ from chsel.problem.settings import (
     positive,
     settings_mapping,
 )
-from chsel.problem.streams import StreamKey
 
 DEFINITIONS = ("default", "paper", "reference", "wide_means", "wide_means_10mm", "wide_sums")
 MOST_POSITIONS = 100_000
@@ -52,19 +52,12 @@ class Offsets:
     z: Axis = ((0.0, 0.1, 15),)
 
     def __post_init__(self) -> None:
-        count = 1
-        for name in ("x", "y", "z"):
-            axis = getattr(self, name)
-            if not axis:
-                raise SettingError(f"{name} has no piece; accepted: at least one")
-            for piece in axis:
-                if not np.isfinite(piece[:2]).all() or piece[2] < 1:
-                    raise SettingError(
-                        f"{name} has the piece {list(piece)}; accepted: [first, last, count], "
-                        "finite metres, a count of at least 1"
-                    )
-            count *= sum(piece[2] for piece in axis)
-        require_at_most("the number of offsets", count, MOST_POSITIONS)
+        counts = [sum(piece[2] for piece in axis) for axis in (self.x, self.y, self.z)]
+        if min(counts) < 1:
+            raise SettingError(
+                f"offsets are {counts} along x, y and z; accepted: at least one along each"
+            )
+        require_at_most("the number of offsets", math.prod(counts), MOST_POSITIONS)
 
     def points(self) -> FloatArray:
         """All offsets (P, 3), those along z fastest."""
@@ -87,20 +80,10 @@ class PoseGridSettings(CheckedSettings):
     extra: Annotated[str, one_of("added", "replaced", "none")] = "added"
     seed: int | None = None  # of the rotations; by default that of the session
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.extra == "replaced" and self.rotations <= self.upright:
-            raise SettingError(
-                f"rotations is {self.rotations}; accepted: more than the {self.upright} upright "
-                "ones that replace some of them"
-            )
-        if self.seed is not None:
-            StreamKey(self.seed, 0)
-
 
 @dataclass(frozen=True)
 class ModeSearchSettings(CheckedSettings):
-    """How members are sought in modes between the poses of the grid, see modes_between.
+    """How members are sought in modes between the poses of the grid.
 
     Poses of the grid climb if their mean over known points is less than `distance` above the true
     pose's, and few points are deeper than `depth` on the wrong side.
@@ -115,11 +98,7 @@ class ModeSearchSettings(CheckedSettings):
 
 @dataclass(frozen=True)
 class PlausibleSettings(CheckedSettings):
-    """The plausible set P_eps = {X : C(X) < C(X*) + eps} (CHSEL, Sec. III and V).
-
-    Without rescan, steps after the first look only at the members of the one before, which is
-    exact only where C cannot fall as points are added, as with sums.
-    """
+    """The plausible set P_eps = {X : C(X) < C(X*) + eps} (CHSEL, Sec. III and V)."""
 
     epsilon: Annotated[float, positive] = 0.001  # eps, metres
     cost: EvaluationCostSettings = field(default_factory=EvaluationCostSettings)  # C
@@ -127,21 +106,12 @@ class PlausibleSettings(CheckedSettings):
     members: Annotated[int, positive] = 1000  # kept for evaluation at most, a random subset
     # With fewer members on the grid, others are sought around them; 0: never.
     fill_to: Annotated[int, not_negative] = 30
-    rescan: bool = True  # look at all poses at every step
     modes: ModeSearchSettings | None = None  # how to look for members far from all on the grid
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.fill_to > self.members:
-            raise SettingError(f"fill_to is {self.fill_to}; accepted: at most members")
 
     @property
     def text(self) -> str:
-        """All settings as JSON; without modes as before they existed, so that digests stay."""
-        mapping = settings_mapping(self)
-        if self.modes is None:
-            del mapping["modes"]
-        return json.dumps(mapping, sort_keys=True)
+        """All settings as JSON."""
+        return json.dumps(settings_mapping(self), sort_keys=True)
 
     @property
     def digest(self) -> str:

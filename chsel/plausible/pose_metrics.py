@@ -119,33 +119,21 @@ def plausible_diversity(distances: FloatArray) -> PlausibleDiversity:
     return PlausibleDiversity(float(nearest_hypothesis.mean()), float(nearest_member.mean()))
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """Whether the true pose could be one of B hypotheses."""
-
-    rank: float  # share in (0, 1] of the B + 1 poses that are at least as far out as the true one;
-    # uniform over many registrations if calibrated, small if the set is too narrow, or off
-    error: float  # mm, root mean squared surface distance from hypotheses to the truth
-
-    def within(self, level: float = 0.05) -> bool:
-        """Whether the truth is not among the outermost `level`."""
-        return self.rank > level
-
-
-def calibration(
+def true_pose_rank(
     distance: SurfaceDistance, object_from_world: FloatArray, world_from_object: FloatArray
-) -> Calibration:
-    """Of hypotheses (B, 4, 4) and the true pose (4, 4). Raises EvaluationError for fewer than 2."""
+) -> float:
+    """Share in (0, 1] of the true pose (4, 4) and hypotheses (B, 4, 4) at least as far out as it.
+
+    Uniform over many registrations if these are calibrated, small if the set is too narrow, or off.
+    Raises EvaluationError for fewer than 2 hypotheses.
+    """
     count = len(object_from_world)
     if count < 2:
-        raise EvaluationError(f"calibration of {count} hypotheses; accepted: at least 2")
+        raise EvaluationError(f"the rank among {count} hypotheses; accepted: at least 2")
     poses = np.concatenate([object_from_world, inverse(world_from_object[None])])
     distances = distance.between(poses, inverse(poses))
     distances = (distances + distances.T) / 2.0
     np.fill_diagonal(distances, 0.0)
-    lengths = np.sqrt(distances)
-    outwards = lengths.sum(axis=1) / count
+    outwards = np.sqrt(distances).sum(axis=1)
     # Rounding must not rank equal poses.
-    rank = (outwards >= outwards[-1] * (1.0 - 1e-9)).mean()
-    error = np.sqrt(distances[-1, :-1].mean())
-    return Calibration(float(rank), float(error))
+    return float((outwards >= outwards[-1] * (1.0 - 1e-9)).mean())

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from chsel.errors import EvaluationError, PoseError, SettingError
+from chsel.errors import EvaluationError, PoseError
 from chsel.numerics.arrays import FloatArray, IntArray, frozen
 from chsel.numerics.cell_set import node_of
 from chsel.numerics.compiler import compiled, leaf
@@ -154,16 +154,13 @@ def scan_grid(cost: EvaluationCost, grid: PoseGrid, limit: float) -> tuple[IntAr
     pieces = [piece for first in sorted(found) for piece in found[first]]
     index = np.concatenate([piece[0] for piece in pieces])
     if len(index) > MOST_MEMBERS:
-        raise EvaluationError(_too_many(cost, limit))
+        violation = cost.model.violation / cost.model.divisors.free
+        raise EvaluationError(
+            f"more than {MOST_MEMBERS:_} poses cost less than {limit:.4g} with {points.count} "
+            f"known points (a violated point: {violation:.4g}); accepted: more known points, a "
+            "smaller epsilon or a larger cost.tolerance"
+        )
     return index, np.concatenate([piece[1] for piece in pieces])
-
-
-def _too_many(cost: EvaluationCost, limit: float) -> str:
-    count, violation = cost.problem.points.count, cost.model.violation / cost.model.divisors.free
-    text = f"more than {MOST_MEMBERS:_} poses cost less than {limit:.4g} with {count} known points"
-    if limit >= violation:
-        text += f", as the true pose costs that much itself (a violated point: {violation:.4g})"
-    return text + "; accepted: more known points, a smaller epsilon or a larger cost.tolerance"
 
 
 def _most_informative_first(known: FloatArray) -> IntArray:
@@ -187,19 +184,15 @@ def _bounds(sdf: SdfGrid, lookup: str) -> FloatArray:
 
 
 def _beyond(sdf: SdfGrid, outside: str) -> tuple[float, float]:
-    """Weights (w, u) of d^2 and s^2 in the least squared distance beyond the grid.
+    """Weights of d^2 and s^2 in the least squared distance beyond the grid.
 
     d: to its box; s: what its nearest point reads. With gradients that point out of the box, the
     way to the surface is at least as long as both together; with others, it may be of any length.
     """
-    if outside == "bounding_box":
-        return 1.0, 0.0
-    for axis in range(3):
-        for end, sign in ((0, -1.0), (-1, 1.0)):
-            face = np.take(sdf.gradients[..., axis], end, axis=axis)
-            if (sign * face).min() <= _LEAST_OUTWARD:
-                return 0.0, 0.0
-    return 1.0, 1.0
+    ends = [(axis, end, sign) for axis in range(3) for end, sign in ((0, -1.0), (-1, 1.0))]
+    faces = [sign * np.take(sdf.gradients[..., axis], end, axis=axis) for axis, end, sign in ends]
+    outward = float(min(face.min() for face in faces) > _LEAST_OUTWARD)
+    return (1.0, 0.0) if outside == "bounding_box" else (outward, outward)
 
 
 class Scan(NamedTuple):
@@ -233,8 +226,8 @@ class ScanBuffer(NamedTuple):
 def scan_rotations(scan: Scan, first: int, last: int, buffer: ScanBuffer) -> tuple[int, int]:
     """Collect the poses below the limit, of rotations from `first` to before `last`.
 
-    Returns the rotation to go on with, which is less than `last` where the buffer may be too small
-    for it, and the number of poses in the buffer.
+    Returns the rotation to go on with, before `last` where the buffer may be too small, and the
+    number of poses in the buffer.
     """
     known, positions = scan.known, scan.positions
     points, shifts, total, count = buffer.points, buffer.shifts, buffer.total, 0
@@ -280,10 +273,7 @@ def _may_be_below(scan: Scan, buffer: ScanBuffer, start: int) -> bool:
 
 @leaf
 def _add_bounds(scan: Scan, buffer: ScanBuffer, start: int, m: int) -> None:
-    """Add what the m-th known point costs at least at positions from `start` on.
-
-    Its place in the grid is that of the exact cost, to the bit.
-    """
+    """Add what the m-th known point costs at least at positions from `start` on."""
     box, bounds, shifts = scan.model.field.box, scan.bounds, buffer.shifts
     beyond, cell, total = buffer.beyond, buffer.cell, buffer.total
     first, last, most, inverse = box.first, box.last, box.most, box.inverse
@@ -324,17 +314,8 @@ class TruePoseSettings(CheckedSettings):
     passes: Annotated[int, positive, at_most(10)] = 2
     cost: EvaluationCostSettings = field(default_factory=EvaluationCostSettings)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.reach / self.spacing > 20.0:
-            raise SettingError(
-                f"spacing is {self.spacing} with reach {self.reach}; accepted: at least a "
-                "twentieth of it"
-            )
 
-
-@dataclass(frozen=True, eq=False)
-class TruePose:
+class TruePose(NamedTuple):
     """The pose of least evaluation cost near a guess."""
 
     world_from_object: FloatArray  # (4, 4)

@@ -9,17 +9,18 @@ surface; one-directional, s the distance to the mesh (CHSEL, Sec. V).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from chsel.errors import PoseError, SettingError
 from chsel.numerics.arrays import FloatArray, IntArray
-from chsel.numerics.cell_set import Places, locate, places_for
+from chsel.numerics.cell_set import locate, places_for
 from chsel.numerics.compiler import compiled
-from chsel.numerics.pose_tuples import composed, inverted, pose_at
+from chsel.numerics.pose_tuples import composed, pose_at
 from chsel.numerics.threads import parallel_for
-from chsel.problem.poses import Poses, compose, inverse, product, rotated, stacked
+from chsel.problem.poses import Poses, product, rotated, stacked
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.sdf_lookup import distance_field, distance_in_place
 from chsel.problem.settings import CheckedSettings, at_most, one_of, positive
@@ -44,7 +45,6 @@ class DistanceSettings(CheckedSettings):
     # the interpolated SDF grid says are the nearest, which are all that the metrics read, and is
     # 10 to 100 times faster; "grid" never.
     method: Annotated[str, one_of(*METHODS)] = "nearest"
-    bidirectional: bool = False  # the mean of d and of d with the roles of the poses swapped
 
 
 class SurfaceDistance:
@@ -90,22 +90,12 @@ class SurfaceDistance:
             distances[rows, columns] = self._exact(to_object, to_world, rows, columns)
         return distances
 
-    @property
-    def _directions(self) -> tuple[bool, ...]:
-        return (False, True) if self.settings.bidirectional else (False,)
-
     def _by_grid(self, to_object: FloatArray, to_world: FloatArray) -> FloatArray:
         """All distances (B, P) by the grid, of poses (B, 12) and (P, 12)."""
-        total = np.zeros((len(to_object), len(to_world)))
-
-        def run(first: int, last: int, places: Places) -> None:
-            for back in self._directions:
-                add_mean_squares(
-                    self._field, self._points, to_object, to_world, back, total, first, last, places
-                )
-
+        total = np.empty((len(to_object), len(to_world)))
+        run = partial(fill_mean_squares, self._field, self._points, to_object, to_world, total)
         parallel_for(run, len(total), lambda: places_for(self._points.shape[1]))
-        return total * (SQUARE_MILLIMETRES / len(self._directions))
+        return total * SQUARE_MILLIMETRES
 
     def _exact(
         self, to_object: FloatArray, to_world: FloatArray, rows: IntArray, columns: IntArray
@@ -114,20 +104,15 @@ class SurfaceDistance:
         total = np.zeros(len(rows))
         count = self._points.shape[1]
         size = max(1, _POINTS_AT_ONCE // count)
-        for back in self._directions:
-            for first in range(0, len(rows), size):
-                some = slice(first, first + size)
-                left, right = to_object[rows[some]], to_world[columns[some]]
-                turn = product(left[:, :3, :3], right[:, :3, :3])
-                shift = rotated(left[:, :3, :3], right[:, :3, 3]) + left[:, :3, 3]
-                moves = compose(turn, shift)
-                moves = (inverse(moves) if back else moves)[:, None]
-                points = rotated(moves[..., :3, :3], self._points.T) + moves[..., :3, 3]
-                squared = self._tree.squared_distance(
-                    self._vertices, self._faces, points.reshape(-1, 3)
-                )[0]
-                total[some] += squared.reshape(-1, count).mean(axis=1)
-        return total * (SQUARE_MILLIMETRES / len(self._directions))
+        for first in range(0, len(rows), size):
+            some = slice(first, first + size)
+            left, right = to_object[rows[some]], to_world[columns[some]]
+            turn = product(left[:, :3, :3], right[:, :3, :3])[:, None]
+            shift = rotated(left[:, :3, :3], right[:, :3, 3]) + left[:, :3, 3]
+            points = (rotated(turn, self._points.T) + shift[:, None]).reshape(-1, 3)
+            squared = self._tree.squared_distance(self._vertices, self._faces, points)[0]
+            total[some] = squared.reshape(-1, count).mean(axis=1)
+        return total * SQUARE_MILLIMETRES
 
 
 def surface_points(mesh: trimesh.Trimesh, count: int, key: StreamKey) -> FloatArray:
@@ -165,21 +150,18 @@ def _nearest(distances: FloatArray) -> tuple[IntArray, IntArray]:
 
 
 @compiled
-def add_mean_squares(field, points, to_object, to_world, back, out, first, last, places):
-    """Add the means of s^2 over moved points (3, Q), m^2, to rows first to last of out (B, P).
+def fill_mean_squares(field, points, to_object, to_world, out, first, last, places):
+    """Fill rows first to last of out (B, P) with the means of s^2 over moved points (3, Q), m^2.
 
-    Points are moved by every pose of to_world (P, 12), then by every one of to_object (B, 12);
-    back: by the inverse of both instead.
+    Points are moved by every pose of to_world (P, 12), then by every one of to_object (B, 12).
     """
     xs, ys, zs = points[0], points[1], points[2]
     for b in range(first, last):
         for p in range(len(to_world)):
             move = composed(pose_at(to_object, b), pose_at(to_world, p))
-            if back:
-                move = inverted(move)
             locate(move, field.box, xs, ys, zs, places, len(xs))
             total = 0.0
             for n in range(len(xs)):
                 s = distance_in_place(field, move, xs[n], ys[n], zs[n], places, n)[0]
                 total += s * s
-            out[b, p] += total / len(xs)
+            out[b, p] = total / len(xs)

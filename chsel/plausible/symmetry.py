@@ -31,8 +31,6 @@ _TESTED = 1000  # points by which a rotation is tested
 _POINTS = 20_000  # points that mark the cells of the coarse grid
 _CELLS = 48  # of the coarse grid, along each axis
 _AT_ONCE = 2000  # rotations
-_MOST_FACES = 100_000  # above this, vertices are merged
-_MERGED = 128  # cells along the longest side
 _ON_SURFACE = 1e-6  # of the radius: nearer, the face's normal is the better direction
 _DAMPING = 1e-4
 
@@ -84,7 +82,18 @@ def object_symmetry(mesh: trimesh.Trimesh) -> ObjectSymmetry:
     """
     key = mesh_digest(mesh)
     if key not in _FOUND:
-        _FOUND[key] = _symmetry(RotatedSurface(mesh))
+        surface = RotatedSurface(mesh)
+        axes = _axes_of_revolution(surface) if surface.radius > 0.0 else np.zeros((0, 3))
+        if len(axes) > 1:
+            found = ObjectSymmetry(surface.centre, sphere=True)
+        elif len(axes) == 1:
+            half_turn = _half_turn_across(surface, axes[0])
+            found = ObjectSymmetry(surface.centre, half_turn, axes[0])
+        elif surface.radius > 0.0:
+            found = ObjectSymmetry(surface.centre, _finite_group(surface))
+        else:
+            found = ObjectSymmetry(surface.centre)
+        _FOUND[key] = found
     return _FOUND[key]
 
 
@@ -93,26 +102,13 @@ def grid_symmetry(sdf: SdfGrid) -> ObjectSymmetry:
     return ObjectSymmetry(object_centre(sdf) if has_surface(sdf) else sdf.bounds.mean(axis=0))
 
 
-def _symmetry(surface: RotatedSurface) -> ObjectSymmetry:
-    if surface.radius == 0.0:
-        return ObjectSymmetry(surface.centre)
-    axes = _axes_of_revolution(surface)
-    if len(axes) > 1:
-        return ObjectSymmetry(surface.centre, sphere=True)
-    if len(axes) == 1:
-        return ObjectSymmetry(surface.centre, _half_turn_across(surface, axes[0]), axes[0])
-    return ObjectSymmetry(surface.centre, _finite_group(surface))
-
-
 class RotatedSurface:
     """The surface of a mesh about its centroid, at unit radius.
 
     A rotation matches if the root mean square distance from the surface, of points of it that are
     rotated, is at most 0.85 % of the diameter, which is twice the distance from the centroid to the
-    farthest vertex. Scans of boxes, cans and bottles that are symmetric by design have up to
-    0.66 %. A tapered can turned upside down has 1.14 %, its scan 1.26 %, and a hammer rotated by
-    half a turn about its handle 1.16 %: a limit for scans that are distorted more would accept
-    these.
+    farthest vertex: scans of objects that are symmetric by design have up to 0.66 %, a tapered can
+    turned upside down has 1.14 %.
     """
 
     centre: FloatArray  # (3,), the surface's centroid in the frame of the mesh, m
@@ -127,16 +123,13 @@ class RotatedSurface:
         import trimesh
 
         vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
-        corners, normals = _corners_normals(vertices, faces)
+        corners = vertices[faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         areas = np.sqrt((normals**2).sum(axis=1))  # twice the areas of faces
         self.centre, self.radius = corners.reshape(-1, 3).mean(axis=0), 0.0
         if not areas.sum() > 0.0:
             return
         self.centre = (areas[:, None] * corners.mean(axis=1)).sum(axis=0) / areas.sum()
-        if len(faces) > _MOST_FACES:
-            vertices, faces = _merged(vertices, faces)
-            corners, normals = _corners_normals(vertices, faces)
-            areas = np.sqrt((normals**2).sum(axis=1))
         self.radius = float(np.sqrt(((corners - self.centre) ** 2).sum(axis=-1)).max())
         self.corners = (corners - self.centre) / self.radius
         self.normals = normals / np.maximum(areas, 1e-300)[:, None]
@@ -205,33 +198,12 @@ def _cells(points: FloatArray) -> tuple[IntArray, IntArray, IntArray]:
     return index[..., 0], index[..., 1], index[..., 2]
 
 
-def _corners_normals(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Corners (F, 3, 3) of faces, and normals (F, 3) as long as twice their areas."""
-    corners = vertices[faces]
-    sides = corners[:, 1:] - corners[:, :1]
-    return corners, np.cross(sides[:, 0], sides[:, 1])
-
-
-def _merged(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """Vertices (V, 3), those of a cell as their mean, and the faces (F, 3) that this leaves."""
-    used = vertices[faces]
-    lower, upper = used.min(axis=(0, 1)), used.max(axis=(0, 1))
-    cell = np.floor((vertices - lower) * (_MERGED / (upper - lower).max())).astype(np.int64)
-    key = (cell[:, 0] * (_MERGED + 1) + cell[:, 1]) * (_MERGED + 1) + cell[:, 2]
-    _, index, count = np.unique(key, return_inverse=True, return_counts=True)
-    sums = [np.bincount(index, weights=vertices[:, axis]) for axis in range(3)]
-    faces = index[faces]
-    a, b, c = faces.T
-    return np.stack(sums, axis=1) / count[:, None], faces[(a != b) & (b != c) & (c != a)]
-
-
 def _axes_of_revolution(surface: RotatedSurface) -> FloatArray:
     """Unit axes (A, 3) about which every rotation matches: none, one, or two of a sphere's.
 
-    Candidates are the axes of inertia and those of slippage. The normals of a surface of revolution
-    meet its axis: rotations about u move points p within the surface where n . (u x p) = 0 (Gelfand
-    and Guibas, 2004, "Shape segmentation using local slippage analysis"). Slippage finds the axis
-    where moments of inertia are equal by chance, inertia where the normals of a scan are noise.
+    Candidates are the axes of inertia, which bear noise of normals, and those of slippage, which
+    bear equal moments: rotations about u move points p within the surface where n . (u x p) = 0
+    (Gelfand and Guibas, 2004).
     """
     middles = (surface.corners + np.roll(surface.corners, 1, axis=1)) / 2.0  # exact for squares
     slips = np.cross(middles, surface.normals[:, None])
@@ -262,8 +234,8 @@ def _half_turn_across(surface: RotatedSurface, axis: FloatArray) -> FloatArray:
 def _finite_group(surface: RotatedSurface) -> FloatArray:
     """The symmetries (S, 3, 3) of a surface without an axis of revolution, the identity first.
 
-    Of rotations spread over SO(3), those that match better than their neighbours on a coarse grid
-    are aligned with the surface. Each, the best first, joins the group if all products match.
+    Rotations that match better than their neighbours on a coarse grid are aligned with the surface.
+    Each, the best first, joins the group if all products match.
     """
     spread, neighbours = _spread()
     coarse = surface.coarse_errors(spread)

@@ -84,16 +84,8 @@ class ConfiguredPolicy(Generic[Settings]):
         if chosen >= 0:
             met = forecast.hit[:, chosen, None]
             contacts = np.where(met, forecast.first.contact[:, chosen], np.nan)
-        return Decision(
-            chosen,
-            stop,
-            forecast.spread,
-            score,
-            forecast.hit_chance,
-            forecast.blocked_chance,
-            forecast.gains.expected_spread,
-            contacts,
-        )
+        chances = forecast.hit_chance, forecast.blocked_chance, forecast.gains.expected_spread
+        return Decision(chosen, stop, forecast.spread, score, *chances, contacts)
 
     def _stop(self, problem: DecisionProblem, forecast: Forecast, feasible: BoolArray) -> str:
         """Why no probe is made, "" if one is."""

@@ -56,19 +56,10 @@ class Steering:
         points: all that are known. available (A,): the actions that can be taken now. Raises
         ChselError if the policy, of another package, gives something else than a decision.
         """
-        require_parts(points=points)
         key = StreamKey(self.seed, done)
-        problem = DecisionProblem(
-            self.sdf,
-            points,
-            self.workspace,
-            self.free_resolution,
-            self.belief(points, hypotheses, key),
-            self.actions,
-            available,
-            self.hand,
-            key,
-        )
+        known = self.sdf, points, self.workspace, self.free_resolution
+        belief = self.belief(points, hypotheses, key)
+        problem = DecisionProblem(*known, belief, self.actions, available, self.hand, key)
         decision = self.policy.decide(problem)
         _check(problem, decision)
         self.last = Choice(problem, decision)
@@ -106,20 +97,15 @@ class Steering:
 
 def _check(problem: DecisionProblem, decision: Decision) -> None:
     """Raise ChselError unless a decision is about this problem."""
-    count, poses, chosen = len(problem.actions), len(problem.belief), decision.chosen
-    wrong = [
-        f"{name} of shape {np.shape(getattr(decision, name))}"
-        for name in ("score", "hit_chance", "blocked_chance", "expected_spread")
-        if np.shape(getattr(decision, name)) != (count,)
-    ]
-    stops = decision.stop != ""
-    taken = not stops and 0 <= chosen < count and bool(problem.available[chosen])
-    if not taken and not (stops and chosen == -1):
-        wrong.append(f"action {chosen} with stop {decision.stop!r}")
-    elif np.shape(decision.contacts) != ((poses, 3) if taken else (0, 3)):
-        wrong.append(f"contacts of shape {np.shape(decision.contacts)}")
-    if wrong:
+    count, chosen = len(problem.actions), decision.chosen
+    stops = decision.stop != "" and chosen == -1
+    taken = decision.stop == "" and 0 <= chosen < count and bool(problem.available[chosen])
+    arrays = "score", "hit_chance", "blocked_chance", "expected_spread", "contacts"
+    shapes = [np.shape(getattr(decision, name)) for name in arrays]
+    contacts = (len(problem.belief) if taken else 0, 3)
+    if not (stops or taken) or shapes != [*[(count,)] * 4, contacts]:
         raise ChselError(
-            f"the policy decided on {wrong[0]}; accepted: an available action of {count} and its "
-            f"contacts in {poses} poses, or -1 with a reason to stop"
+            f"the policy decided on action {chosen} with stop {decision.stop!r} and arrays of "
+            f"shapes {shapes}; accepted: an available action, or -1 with a reason to stop, arrays "
+            f"of shape ({count},) and contacts of shape {contacts}"
         )

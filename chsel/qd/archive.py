@@ -42,10 +42,7 @@ class Evaluated(NamedTuple):
 
 
 def evaluated(
-    objective: SearchObjective,
-    measure: Measure,
-    vectors: FloatArray,
-    costs: FloatArray | None = None,
+    objective: SearchObjective, measure: Measure, vectors: FloatArray, costs: Any = None
 ) -> Evaluated:
     """Vectors (B, d) with their measures, and their costs (B,) unless these are known already."""
     costs = objective.costs(vectors) if costs is None else costs
@@ -89,19 +86,9 @@ def batch_of(count: int, dimension: int, measures: int) -> Batch:
     )
 
 
-@compiled
-def cells_of(archive: Cells, measures: FloatArray, cells: IntArray) -> None:
-    """Fill cells (B,) for measures (B, k); -1 for measures that are not finite."""
-    for i in range(len(cells)):
-        cells[i] = cell_for(archive, 0.0, measures[i], measures[i])
-
-
 @inner
 def cell_for(archive: Cells, objective: float, vector: FloatArray, measures: FloatArray) -> int:
-    """The cell of a solution, the nearest one for measures (k,) out of range.
-
-    -1 if any of the numbers is not finite.
-    """
+    """The cell of a solution, the nearest one for measures (k,) out of range; -1 if not finite."""
     if not (np.isfinite(objective) and all_finite(measures) and all_finite(vector)):
         return -1
     lower, upper, bins, cell = archive.lower, archive.upper, archive.bins, 0
@@ -137,11 +124,10 @@ def insert(archive: Cells, batch: Batch) -> None:
     cells, status, value = batch.cells, batch.status, batch.value
     for i in range(len(objectives)):
         cells[i] = cell_for(archive, objectives[i], vectors[i], measures[i])
-        status[i], value[i] = 0, -np.inf
-        if cells[i] < 0:
-            continue
         old = archive.objectives[cells[i]]
-        if old == -np.inf:
+        if cells[i] < 0:
+            status[i], value[i] = 0, -np.inf
+        elif old == -np.inf:
             status[i], value[i] = 2, objectives[i]
         else:
             status[i], value[i] = int(objectives[i] > old), objectives[i] - old
@@ -160,15 +146,12 @@ def _precedes(status: IntArray, value: FloatArray, i: int, j: int) -> bool:
 
 @inner
 def rank(status: IntArray, value: FloatArray, order: IntArray) -> int:
-    """Fill the order (B,): by status, by value, the later first. Returns how many improved.
-
-    By Shell's sort; the order is total, so that all sorting algorithms give the same.
-    """
+    """Fill the order (B,): by status, by value, the later first. Returns how many improved."""
     count, improved = len(order), 0
     for i in range(count):
         order[i] = i
         improved += int(status[i] > 0)
-    gap = count // 2
+    gap = count // 2  # Shell's sort; the order is total, so that all algorithms give the same
     while gap > 0:
         for i in range(gap, count):
             item, place = order[i], i
@@ -202,13 +185,7 @@ class GridArchive:
     """
 
     def __init__(
-        self,
-        measure: Measure,
-        lower: FloatArray,
-        upper: FloatArray,
-        *,
-        bins: int,
-        dimension: int,
+        self, measure: Measure, lower: FloatArray, upper: FloatArray, *, bins: int, dimension: int
     ) -> None:
         self.measure = measure
         self.shape = (bins,) * measure.count
@@ -224,28 +201,17 @@ class GridArchive:
             measures=np.zeros((cells, measure.count)),
         )
 
-    def cells_of(self, measures: FloatArray) -> IntArray:
-        """Row-major index (B,) of the cell of measures (B, k), last measure fastest.
+    def add(self, solutions: FloatArray, objectives: FloatArray, measures: FloatArray) -> Batch:
+        """Offer solutions (B, d) with objectives (B,) and measures (B, k).
 
-        -1 for measures that are not finite.
-        """
-        cells = np.zeros(len(measures), dtype=np.int64)
-        cells_of(self.cells, np.array(measures, dtype=np.float64, order="C"), cells)
-        return cells
-
-    def add(
-        self, solutions: FloatArray, objectives: FloatArray, measures: FloatArray
-    ) -> tuple[IntArray, FloatArray]:
-        """Offer solutions (B, d) with objectives (B,) and measures (B, k); status and value (B,).
-
-        Against the archive before: 2 and the objective for an empty cell, 1 for a higher objective
-        and 0 for a lower one, and the gain. A cell keeps the highest, the first of equals. A
-        solution of which any number is not finite is refused: 0 and -inf.
+        Status and value against the archive before: 2 and the objective for an empty cell, 1 for a
+        higher objective and 0 for a lower one, and the gain. A cell keeps the highest, the first of
+        equals. A solution of which any number is not finite is refused: cell -1, 0 and -inf.
         """
         batch = batch_of(len(solutions), self.cells.solutions.shape[1], self.measure.count)
         batch.vectors[:], batch.objectives[:], batch.measures[:] = solutions, objectives, measures
         insert(self.cells, batch)
-        return batch.status, batch.value
+        return batch
 
     def update_cells(self, *offered: Evaluated) -> None:
         """Offer one batch of solutions after the other (CHSEL, Alg. 1, line 5)."""

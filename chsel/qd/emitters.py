@@ -19,7 +19,7 @@ from chsel.cost.objective import (
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.pose_tuples import all_finite
-from chsel.problem.registration_problem import NullObserver, Observer
+from chsel.problem.registration_problem import Observer
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd.archive import (
@@ -39,8 +39,7 @@ from chsel.qd.measures import measure_gradients_of, measures_of
 
 SEARCHES = "cma_mega", "cma_me"  # Fontaine and Nikolaidis, 2021; Fontaine et al., 2020
 MOST_ITERATIONS = 1_000_000
-_TRACED = 10  # iterations between two traces
-_MOST_NORMALS = 4_000_000  # normal numbers held at once, 8 bytes each
+_TRACED = 10  # iterations between two traces; even, so that no pair of normal numbers is split
 _EPSILON = 1e-8  # keeps the normalisation of a zero gradient finite
 
 
@@ -68,13 +67,6 @@ class Landscape(NamedTuple):
     space: Any
     measure: Any  # MeasureCode
     work: Any  # scratch
-
-
-class RandomNumbers(NamedTuple):
-    """Random numbers of some iterations."""
-
-    normals: FloatArray  # (iterations, L, n), standard normal, for the strategy
-    elites: FloatArray  # (iterations,), uniform, each chooses an elite for a restart
 
 
 class Adam(NamedTuple):
@@ -108,8 +100,12 @@ class MeSearch(NamedTuple):
 
 
 @compiled
-def mega_iterations(landscape, archive, search, random, first, last):
-    """Iterations of CMA-MEGA (Fontaine and Nikolaidis, 2021) from `first` to before `last`."""
+def mega_iterations(landscape, archive, search, normals, elites, first, last):
+    """Iterations of CMA-MEGA (Fontaine and Nikolaidis, 2021) from `first` to before `last`.
+
+    normals: (iterations, L, n) for the strategy. elites: (iterations,) in [0, 1), each of which
+    chooses an elite for a restart.
+    """
     model, space, measure, work = landscape
     theta, measures, gradient = search.theta, search.measures, search.gradient
     measure_gradients, directions = search.measure_gradients, search.directions
@@ -118,21 +114,21 @@ def mega_iterations(landscape, archive, search, random, first, last):
         objective = -cost_and_gradient_of(model, space, theta, gradient, work)
         measures_of(space, measure, theta, measures)
         measure_gradients_of(space, measure, theta, measure_gradients)
-        keep_better(
-            archive, cell_for(archive, objective, theta, measures), objective, theta, measures
-        )
+        cell = cell_for(archive, objective, theta, measures)
+        keep_better(archive, cell, objective, theta, measures)
         _normalise(gradient, -1.0, directions[0])
         for i in range(len(measures)):
             _normalise(measure_gradients[i], 1.0, directions[i + 1])
-        ask(strategy, random.normals[iteration], coefficients)
+        ask(strategy, normals[iteration], coefficients)
         _branch(theta, directions, coefficients, branches.vectors)
         _evaluate(landscape, branches)
         insert(archive, branches)
         parents = rank(branches.status, branches.value, branches.order)
         tell(strategy, coefficients, branches.order, parents)
         if parents == 0 or stopped(strategy, branches.order, branches.status, branches.value):
-            _move_to_elite(archive, random.elites[iteration], theta)
-            _forget(search.adam)
+            _move_to_elite(archive, elites[iteration], theta)
+            search.adam.moments[:] = 0.0
+            search.adam.powers[:] = 1.0
             reset(strategy)
             strategy.mean[:] = 0.0
         else:
@@ -140,17 +136,17 @@ def mega_iterations(landscape, archive, search, random, first, last):
 
 
 @compiled
-def me_iterations(landscape, archive, search, random, first, last):
-    """Iterations of CMA-ME (Fontaine et al., 2020) from `first` to before `last`."""
+def me_iterations(landscape, archive, search, normals, elites, first, last):
+    """The same of CMA-ME (Fontaine et al., 2020)."""
     samples, strategy = search.samples, search.strategy
     for iteration in range(first, last):
-        ask(strategy, random.normals[iteration], samples.vectors)
+        ask(strategy, normals[iteration], samples.vectors)
         _evaluate(landscape, samples)
         insert(archive, samples)
         parents = rank(samples.status, samples.value, samples.order)
         tell(strategy, samples.vectors, samples.order, parents)
         if parents == 0 or stopped(strategy, samples.order, samples.status, samples.value):
-            _move_to_elite(archive, random.elites[iteration], strategy.mean)
+            _move_to_elite(archive, elites[iteration], strategy.mean)
             reset(strategy)
 
 
@@ -179,9 +175,7 @@ def _normalise(gradient: FloatArray, sign: float, out: FloatArray) -> None:
 
 
 @inner
-def _branch(
-    theta: FloatArray, directions: FloatArray, coefficients: FloatArray, out: FloatArray
-) -> None:
+def _branch(theta, directions, coefficients, out):
     """Fill out (L, d) with theta + sum_i c_i g_i: coefficients c (L, n), directions g (n, d)."""
     for b in range(len(out)):
         for j in range(len(theta)):
@@ -201,9 +195,7 @@ def _move_to_elite(archive: Cells, uniform: float, vector: FloatArray) -> None:
 
 
 @inner
-def _move_towards(
-    theta: FloatArray, branches: Batch, weights: FloatArray, parents: int, adam: Adam
-) -> None:
+def _move_towards(theta, branches, weights, parents, adam):
     """One step of Adam from theta to the weighted mean of the best branches, its parents."""
     vectors, order = branches.vectors, branches.order
     moments, powers = adam.moments, adam.powers
@@ -216,14 +208,6 @@ def _move_towards(
         theta[j] += adam_step(towards, moments, j, powers, adam.rate, adam.epsilon)
 
 
-@inner
-def _forget(adam: Adam) -> None:
-    """Start Adam again."""
-    for j in range(adam.moments.shape[1]):
-        adam.moments[0, j] = adam.moments[1, j] = 0.0
-    adam.powers[0] = adam.powers[1] = 1.0
-
-
 def mega_search(
     start: FloatArray,
     measures: int,
@@ -232,8 +216,7 @@ def mega_search(
     epsilon: float = EPSILON,
 ) -> MegaSearch:
     """CMA-MEGA at theta = start (d,), with so many measures and branches; epsilon is Adam's."""
-    d, n = len(start), measures + 1
-    parity = settings.ribs_parity
+    d, n, parity = len(start), measures + 1, settings.ribs_parity
     return MegaSearch(
         theta=np.array(start, dtype=np.float64),
         measures=np.zeros(measures),
@@ -269,37 +252,28 @@ def fill_archive(
 
     CMA-MEGA: theta, at first `start` (d,), with its gradients, and branches around it. CMA-ME:
     samples of an evolution strategy, whose first mean is `start`. refinement: index of the pass.
-    No random number depends on how many are drawn at a time.
     """
     measures, total = archive.measure.count, settings.iterations
-    search: MegaSearch | MeSearch
+    search: Any = me_search(start, measures, count, settings)
+    run = me_iterations
     if name == "cma_mega":
         run, search = mega_iterations, mega_search(start, measures, max(count - 1, 1), settings)
-    else:
-        run, search = me_iterations, me_search(start, measures, count, settings)
     batch, dimension = search.strategy.batch, len(search.strategy.mean)
     model, space = objective.model, objective.space_arrays
     landscape = Landscape(model, space, archive.measure.code, objective.work())
     stream = key.stream(Purpose.EMITTER, refinement)
     elites = key.stream(Purpose.RESTART, refinement).random(total)
-    # A multiple of 10, so that no pair of normal numbers is split.
-    block = 10 * max(1, min(100, _MOST_NORMALS // (10 * batch * dimension)))
-    is_watched = type(observer) is not NullObserver
-    interval = observer.snapshot_interval or _TRACED
-    if is_watched:
-        observer.trace(name, 0, archive.solutions, archive.costs)
-        observer.snapshot(archive.snapshot(0, refinement))
-    for begin in range(0, total, block):
-        end = min(begin + block, total)
-        random = RandomNumbers(normals(stream, (end - begin, batch, dimension)), elites[begin:end])
-        between = range(begin + 1, end if is_watched else begin)
-        stops = [n for n in between if n % _TRACED == 0 or n % interval == 0]
+    interval = observer.snapshot_interval or total
+    observer.trace(name, 0, archive.solutions, archive.costs)
+    observer.snapshot(archive.snapshot(0, refinement))
+    for begin in range(0, total, _TRACED):
+        end = min(begin + _TRACED, total)
+        random = normals(stream, (end - begin, batch, dimension)), elites[begin:end]
+        stops = [n for n in range(begin + 1, end) if n % interval == 0]
         for first, last in pairwise([begin, *stops, end]):
-            run(landscape, archive.cells, search, random, first - begin, last - begin)
-            if is_watched and (last % _TRACED == 0 or last == total):
+            run(landscape, archive.cells, search, *random, first - begin, last - begin)
+            if last == end:
                 observer.trace(name, last, archive.solutions, archive.costs)
                 observer.progress(name, last, total)
-            if is_watched and (
-                last == total or (observer.snapshot_interval and last % interval == 0)
-            ):
+            if last == total or last % interval == 0:
                 observer.snapshot(archive.snapshot(last, refinement))

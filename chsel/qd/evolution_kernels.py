@@ -36,7 +36,7 @@ class Strategy(NamedTuple):
     sigma: FloatArray  # (1,), step size
     evaluations: IntArray  # (1,), since the reset
     decomposed_at: IntArray  # (1,), evaluations at the last decomposition
-    gap: FloatArray  # (1,), evaluations between two decompositions
+    gap: FloatArray  # (1,), evaluations between two decompositions: by the rates of L / 2 parents
     logarithms: FloatArray  # (2, L), ln i and ln(i + 1/2), from i = 1
     weights: FloatArray  # (L,), of the last parents
     scratch: FloatArray  # (2, n)
@@ -89,7 +89,9 @@ def ask(strategy: Strategy, normals: FloatArray, samples: FloatArray) -> None:
     mean, values, vectors = strategy.mean, strategy.eigenvalues, strategy.eigenvectors
     n, evaluations = len(mean), strategy.evaluations[0]
     if evaluations == 0:
-        strategy.gap[0] = _gap(n, strategy.batch, strategy.logarithms, strategy.weights)
+        mueff = _weigh(strategy.logarithms, max(strategy.batch // 2, 1), strategy.weights)
+        _, _, c1, cmu, _ = _learning_rates(n, mueff)
+        strategy.gap[0] = 0.5 * n * strategy.batch / ((c1 + cmu) * n * n)
     elif evaluations > strategy.decomposed_at[0] + strategy.gap[0]:
         decompose(strategy.covariance, strategy.work, values, vectors)
         for e in range(n):
@@ -102,14 +104,6 @@ def ask(strategy: Strategy, normals: FloatArray, samples: FloatArray) -> None:
             along = strategy.sigma[0] * np.sqrt(values[e]) * normals[i, e]
             for j in range(n):
                 samples[i, j] += along * vectors[j, e]
-
-
-@inner
-def _gap(n: int, batch: int, logarithms: FloatArray, weights: FloatArray) -> float:
-    """Evaluations between decompositions: n L / (2 (c_1 + c_mu) n^2), rates of L / 2 parents."""
-    mueff = _weigh(logarithms, max(batch // 2, 1), weights)
-    _, _, c1, cmu, _ = _learning_rates(n, mueff)
-    return 0.5 * n * batch / ((c1 + cmu) * n * n)
 
 
 @inner

@@ -11,7 +11,6 @@ from chsel.errors import ChselError, require_at_most
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SearchSpace, origin_bounds
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.subset import evenly_spaced, representative_poses
@@ -40,20 +39,10 @@ class ArchiveSettings(CheckedSettings):
     tolerance_per_point: Annotated[float, not_negative] = 1e-3  # tolerance per known point
     tolerance: Annotated[float, not_negative] = 1e-6  # its floor
 
+    _OTHERS: ClassVar = {"measure": "position_2", "bins": 40, "least_deviation": 1e-4}
     presets: ClassVar[Presets] = {
-        "paper": {
-            "measure": "position_2",
-            "bins": 40,
-            "least_deviation": 1e-4,
-            "outliers": "none",
-        },
-        "reference": {
-            "measure": "position_2",
-            "bins": 40,
-            "least_deviation": 1e-4,
-            "tolerance_per_point": 0.0,
-            "tolerance": 0.1,
-        },
+        "paper": _OTHERS | {"outliers": "none"},
+        "reference": _OTHERS | {"tolerance_per_point": 0.0, "tolerance": 0.1},
     }
 
     def __post_init__(self) -> None:
@@ -97,22 +86,19 @@ class OutputSettings(CheckedSettings):
     }
 
 
-def measure_range(
-    estimates: Evaluated, measure: Measure, settings: ArchiveSettings, known_count: int
-) -> tuple[FloatArray, FloatArray]:
-    """Mean and standard deviation (k,) of the measures of estimates E' that are no outliers."""
-    kept = estimates.measures[_inliers(estimates.costs, settings, known_count)]
-    return measure.moments(kept if len(kept) >= 2 else estimates.measures)
-
-
 def sized_archive(
+    estimates: Evaluated,
     measure: Measure,
-    mean: FloatArray,
-    deviation: FloatArray,
     settings: ArchiveSettings,
+    known_count: int,
     dimension: int,
 ) -> GridArchive:
-    """An empty archive of vectors (d,) with the range mean +- b_sigma deviations (k,)."""
+    """An empty archive of vectors (d,) with the range mean +- b_sigma standard deviations (k,).
+
+    Of the measures of estimates E' that are no outliers, by the number of known points.
+    """
+    kept = estimates.measures[_inliers(estimates.costs, settings, known_count)]
+    mean, deviation = measure.moments(kept if len(kept) >= 2 else estimates.measures)
     half = settings.range_sigmas * np.maximum(deviation, settings.least_deviation)
     if measure.circular:
         half = np.minimum(half, np.pi)
@@ -143,7 +129,9 @@ def select_elites(
     good = order[costs[order] <= _limit(costs[order], settings, known_count)]
     if settings.choice == "representative" and len(good) > count and has_surface(problem.sdf):
         poses = elites[good]
-        chosen = representatives(problem.sdf, poses, count)
+        pool = evenly_spaced(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
+        most = min(count, _MOST_REPRESENTATIVE)
+        chosen = pool[representative_poses(problem.sdf, poses[pool], most)]
         others = np.setdiff1d(np.arange(len(poses)), chosen)
         others = others[evenly_spaced(len(others), count - len(chosen))]
         return good[np.sort(np.concatenate([chosen, others]))]
@@ -155,10 +143,7 @@ def select_elites(
 
 
 def within_workspace(
-    poses: Poses,
-    problem: RegistrationProblem,
-    space: SearchSpace,
-    margin: float | None,
+    poses: Poses, problem: RegistrationProblem, space: SearchSpace, margin: float | None
 ) -> BoolArray:
     """True (B,) where the object's origin is in the workspace, widened by a margin in metres.
 
@@ -170,15 +155,6 @@ def within_workspace(
     lower, upper = origin_bounds(problem.workspace, space, margin)
     inside: BoolArray = np.all((poses.origins >= lower) & (poses.origins <= upper), axis=1)
     return inside if inside.any() else everywhere
-
-
-def representatives(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
-    """Which of poses to take, `count` at most, so that all are near to one; the first always is.
-
-    Of many poses, those to choose from are taken evenly.
-    """
-    pool = evenly_spaced(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
-    return pool[representative_poses(sdf, poses[pool], min(count, _MOST_REPRESENTATIVE))]
 
 
 def _limit(costs: FloatArray, settings: OutputSettings, known_count: int) -> float:

@@ -10,7 +10,7 @@ left out: it moves the line where the force is inclined to the normal.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -55,11 +55,7 @@ def smooth(image: FloatArray, side: int) -> FloatArray:
 
 
 def contact_mask(
-    deformation: FloatArray,
-    *,
-    quantile: float,
-    threshold: float,
-    valid: BoolArray | None = None,
+    deformation: FloatArray, *, quantile: float, threshold: float, valid: BoolArray | None = None
 ) -> BoolArray:
     """Pixels (H, W) in contact: deformed by more than a quantile of all and by over `threshold` m.
 
@@ -98,8 +94,7 @@ def share(counts: Sequence[int], most: int) -> list[int]:
     return shares
 
 
-@dataclass(frozen=True, eq=False)
-class ForceContact:
+class ForceContact(NamedTuple):
     """A contact on a body."""
 
     point: FloatArray  # (3,), metres

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import label
+from scipy.ndimage import label, minimum_filter
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from chsel.errors import PointsError, SettingError, require_at_most, require_positive
+from chsel.errors import PointsError, SettingError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 
 MOST_PIXELS = 100_000  # on a side
@@ -36,17 +36,15 @@ class PinholeCamera:
     cy: float
 
     def __post_init__(self) -> None:
-        for name in ("width", "height"):
-            value = getattr(self, name)
-            require_positive(f"camera {name}", value)
-            require_at_most(f"camera {name}", value, MOST_PIXELS)
-            if int(value) != value:
-                raise SettingError(f"camera {name} is {value}; accepted: a whole number")
+        for name, value in (("width", self.width), ("height", self.height)):
+            if value not in range(1, MOST_PIXELS + 1):
+                raise SettingError(
+                    f"camera {name} is {value}; accepted: a whole number from 1 to {MOST_PIXELS:_}"
+                )
         require_positive("camera fx", self.fx)
         require_positive("camera fy", self.fy)
-        for name, value in (("cx", self.cx), ("cy", self.cy)):
-            if not np.isfinite(value):
-                raise SettingError(f"camera {name} is {value}; accepted: a finite number")
+        if not np.isfinite([self.cx, self.cy]).all():
+            raise SettingError(f"camera cx, cy are {self.cx}, {self.cy}; accepted: finite numbers")
 
     @property
     def columns(self) -> FloatArray:
@@ -107,34 +105,12 @@ def occlusion_edges(
     return valid & ((furthest - depth > jump) | (depth - nearest > jump))
 
 
-def nearest_around(
-    depth: FloatArray, valid: BoolArray, pixels: BoolArray, *, reach: int
-) -> FloatArray:
-    """Depths (H, W) in which `pixels` (H, W) have the least of all valid ones around them.
-
-    depth (H, W): metres. valid (H, W): pixels that count, those of `pixels` among them. reach: how
-    many pixels away others are looked at, along rows and columns.
-    """
-    depth = np.asarray(depth, np.float64)
-    if not pixels.any():
-        return depth
-    return np.where(pixels, _least_around(np.where(valid, depth, np.inf), reach), depth)
-
-
 def _least_around(image: FloatArray, reach: int) -> FloatArray:
     """The least (H, W) of the pixels up to `reach` away from each, along rows and columns."""
-    least = np.pad(image, reach, constant_values=np.inf)
-    side, size = 1, 2 * reach + 1
-    while side < size:
-        step = min(side, size - side)
-        least = np.minimum(least[step:], least[:-step])
-        least = np.minimum(least[:, step:], least[:, :-step])
-        side += step
-    return least
+    return minimum_filter(image, 2 * reach + 1, mode="constant", cval=np.inf)
 
 
-@dataclass(frozen=True, eq=False)
-class MainRegions:
+class MainRegions(NamedTuple):
     """The measurements that belong together, and how many were left out by which reason."""
 
     kept: BoolArray  # (N,)
@@ -224,9 +200,9 @@ def speckle_free(
     Pixels in regions of fewer than `least` pixels have the least depth of all valid ones (H, W)
     around them, so far that some are not of their region: if those are right, no ray is too long.
     """
-    speckles = small_regions(regions, least)
-    reach = isqrt(least) // 2 + 2
-    return nearest_around(depth, valid, speckles, reach=reach), int(speckles.sum())
+    speckles, depth = small_regions(regions, least), np.asarray(depth, np.float64)
+    around = _least_around(np.where(valid, depth, np.inf), isqrt(least) // 2 + 2)
+    return np.where(speckles, around, depth), int(speckles.sum())
 
 
 def _linked(one: FloatArray, other: FloatArray, share: float) -> BoolArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import floor, inf
+from math import floor, inf, prod
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 MOST_VOXELS = 200_000_000  # two bytes each
 MOST_VIEWS = 250
-SCALES = np.linspace(0.95, 0.40, 20)  # of depth, as the reference implementation has them
 _REPORTED = 255  # more than any number of views
 _RAYS_PER_THREAD = 20_000
 _POINTS_PER_THREAD = 100_000
@@ -79,17 +78,16 @@ class FreeGrid:
     def __init__(self, workspace: Workspace, spacing: float, *, views: int = 1) -> None:
         """spacing: side of a voxel, metres. views: how many views make a voxel free.
 
-        A view is one call of along_rays, from_depth or scaled_images. Raises SettingError for a
-        grid that is too large.
+        A view is one call of along_rays or from_depth. Raises SettingError for a grid that is too
+        large.
         """
-        require_positive("views", views)
-        if views > MOST_VIEWS or int(views) != views:
+        if views not in range(1, MOST_VIEWS + 1):
             raise SettingError(f"views is {views}; accepted: a whole number up to {MOST_VIEWS}")
         self.lattice = Lattice(workspace.lower, spacing)
         self.shape = _shape(workspace, spacing)
         self.count = 0
         self._views = int(views)
-        voxels = int(np.prod(self.shape))
+        voxels = prod(self.shape)
         marks = np.zeros(voxels, dtype=np.uint8)  # in the current view
         self._seen = np.zeros(voxels, dtype=np.uint8)  # number of views, then _REPORTED
         self._grid = MarkedVoxels(marks, self.shape, np.array(workspace.lower), float(spacing))
@@ -121,31 +119,13 @@ class FreeGrid:
         rigid.
         """
         require_positive("fraction", fraction)
-        move, mask = _pose(world_from_camera), camera.image("mask", mask, bool)
+        move = frozen("world_from_camera", world_from_camera, (4, 4), error=PoseError)
+        check_rigid("world_from_camera", move[None], SENSOR_TOLERANCE)
+        mask = camera.image("mask", mask, bool)
         parts = camera.image("depth", depth), mask, camera.columns, camera.rows
         image = RayImage(*(np.require(part, requirements=("C", "W")) for part in parts))
         pose, least = tuple(Poses.of(move[None]).numbers[0]), -(-_RAYS_PER_THREAD // camera.width)
         self._mark(mark_image, image, pose, float(fraction), count=camera.height, least=least)
-        return self._settle(1)
-
-    def scaled_images(
-        self,
-        depth: FloatArray,
-        camera: PinholeCamera,
-        world_from_camera: FloatArray,
-        mask: BoolArray,
-        factors: FloatArray = SCALES,
-    ) -> int:
-        """One view: mark the points of images whose depth is scaled by each of the factors (F,).
-
-        As in the reference implementation, which leaves gaps between the images and in front of
-        all. Otherwise as from_depth.
-        """
-        move, mask = _pose(world_from_camera), camera.image("mask", mask, bool)
-        factors = frozen("factors", factors, (None,), error=SettingError)
-        moves = np.repeat(move[None], len(factors), axis=0)
-        moves[:, :3, :3] *= factors[:, None, None]  # about the camera
-        self._mark_points(camera.back_project(depth)[mask], moves)
         return self._settle(1)
 
     def at(self, points: Any, *, poses: FloatArray = _STAY) -> int:
@@ -155,7 +135,8 @@ class FreeGrid:
         Raises PoseError for poses that are not finite.
         """
         poses = frozen("poses", np.reshape(poses, (-1, 4, 4)), (None, 4, 4), error=PoseError)
-        self._mark_points(_rows("points", points), np.array(poses))
+        points, least = _rows("points", points), -(-_POINTS_PER_THREAD // max(len(poses), 1))
+        self._mark(mark_points, points, Poses.of(poses).numbers, count=len(points), least=least)
         return self._settle(self._views)
 
     def new(self) -> FloatArray:
@@ -163,10 +144,6 @@ class FreeGrid:
         voxels = np.flatnonzero(self._seen == self._views)
         self._seen[voxels] = _REPORTED
         return self.lattice.centres(np.stack(np.unravel_index(voxels, self.shape), axis=1))
-
-    def _mark_points(self, points: FloatArray, moves: FloatArray) -> None:
-        numbers, least = Poses.of(moves).numbers, -(-_POINTS_PER_THREAD // max(len(moves), 1))
-        self._mark(mark_points, points, numbers, count=len(points), least=least)
 
     def _mark(self, kernel: Callable[..., None], *arguments: Any, count: int, least: int) -> None:
         """Run a kernel on pieces of range(count), of at least `least`, on several threads."""
@@ -211,13 +188,6 @@ def _rows(name: str, points: Any) -> FloatArray:
     if rows.ndim != 2 or rows.shape[1] != 3:
         raise PointsError(f"{name} has shape {rows.shape}; accepted: (any, 3)")
     return np.require(rows, requirements=("C", "W"))  # one type of array, so one compilation
-
-
-def _pose(world_from_camera: FloatArray) -> FloatArray:
-    """A checked copy."""
-    pose = frozen("world_from_camera", world_from_camera, (4, 4), error=PoseError)
-    check_rigid("world_from_camera", pose[None], SENSOR_TOLERANCE)
-    return np.array(pose)
 
 
 @compiled
@@ -289,9 +259,9 @@ def _walk(grid, a, b):
     enters, leaves = _clipped(az, dz, nz, enters, leaves)
     if enters >= leaves:
         return
-    i, far_i = _voxel(ax, dx, enters, nx), _voxel(ax, dx, leaves, nx)
-    j, far_j = _voxel(ay, dy, enters, ny), _voxel(ay, dy, leaves, ny)
-    k, far_k = _voxel(az, dz, enters, nz), _voxel(az, dz, leaves, nz)
+    i, far_i = _within(ax + enters * dx, nx), _within(ax + leaves * dx, nx)
+    j, far_j = _within(ay + enters * dy, ny), _within(ay + leaves * dy, ny)
+    k, far_k = _within(az + enters * dz, nz), _within(az + leaves * dz, nz)
     if leaves == 1.0:  # the end itself, without rounding
         far_i, far_j, far_k = _within(b[0], nx), _within(b[1], ny), _within(b[2], nz)
     step_i, face_i, left_i, inverse_x = _crossings(i, far_i, dx)
@@ -345,13 +315,7 @@ def _clipped(a, d, count, enters, leaves):
 
 
 @leaf
-def _voxel(a, d, at, count):
-    return _within(a + at * d, count)
-
-
-@leaf
 def _within(place, count):
-    """The voxel of a place; rounding may have left it just outside."""
     return min(max(floor(place), 0), count - 1)
 
 
@@ -376,8 +340,20 @@ def interior_lattice(
     import trimesh
 
     require_positive("spacing", spacing)
-    solids = [meshes] if isinstance(meshes, trimesh.Trimesh) else meshes
-    return np.concatenate([np.zeros((0, 3)), *(_inside(solid, spacing) for solid in solids)])
+    inside = [np.zeros((0, 3))]
+    for mesh in [meshes] if isinstance(meshes, trimesh.Trimesh) else meshes:
+        lower, upper = np.asarray(mesh.bounds, dtype=np.float64)
+        each_side = np.floor(0.5 * (upper - lower) / spacing)
+        count = float(np.prod(2.0 * each_side + 1.0))
+        if not count <= MOST_NODES:
+            raise SettingError(
+                f"spacing is {spacing:g} m, which makes {count:.3g} nodes in a solid; accepted: a "
+                f"spacing that makes at most {MOST_NODES:_}"
+            )
+        axes = np.meshgrid(*[np.arange(-n, n + 1.0) * spacing for n in each_side], indexing="ij")
+        nodes = 0.5 * (lower + upper) + np.stack(axes, -1).reshape(-1, 3)
+        inside.append(nodes[mesh_sdf(mesh, nodes)[0] < -_DEEPEST_ON_SURFACE])
+    return np.concatenate(inside)
 
 
 def poses_between(poses: FloatArray, *, step: float, radius: float) -> FloatArray:
@@ -411,20 +387,6 @@ def poses_between(poses: FloatArray, *, step: float, radius: float) -> FloatArra
     fraction = (part / np.repeat(pieces, pieces))[between]
     path[between] = interpolated(kept[start[between]], kept[start[between] + 1], fraction)
     return np.concatenate([path, kept[-1:]])
-
-
-def _inside(mesh: trimesh.Trimesh, spacing: float) -> FloatArray:
-    lower, upper = np.asarray(mesh.bounds, dtype=np.float64)
-    each_side = np.floor(0.5 * (upper - lower) / spacing)
-    count = float(np.prod(2.0 * each_side + 1.0))
-    if not count <= MOST_NODES:
-        raise SettingError(
-            f"spacing is {spacing:g} m, which makes {count:.3g} nodes in a solid; accepted: a "
-            f"spacing that makes at most {MOST_NODES:_}"
-        )
-    axes = [np.arange(-n, n + 1.0) * spacing for n in each_side]
-    nodes = 0.5 * (lower + upper) + np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    return nodes[mesh_sdf(mesh, nodes)[0] < -_DEEPEST_ON_SURFACE]
 
 
 def _motion(first: FloatArray, second: FloatArray, radius: float) -> FloatArray:

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from chsel.methods.anchor_sampling import AnchorSampler, most_informative_first
-from chsel.methods.anchored.anchored import Anchored, Search
-from chsel.methods.anchored.anchored_settings import EFFORTS, AnchoredSettings
+from chsel.methods.anchored.anchored import EFFORTS, Anchored, AnchoredSettings, Search
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import NullObserver, RegistrationProblem

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from chsel.methods import trust_by
-from chsel.methods.anchored.anchored import Anchored
-from chsel.methods.anchored.anchored_settings import AnchoredSettings
+from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
 from chsel.problem.noise import FOREIGN
 from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.outline import signed_distances

@@ -12,7 +12,7 @@ import trimesh
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.plausible_set import PlausibleSet
 from chsel.plausible.plausible_settings import PlausibleSettings, definition_name
-from chsel.plausible.pose_metrics import calibration, cheapest, plausible_diversity
+from chsel.plausible.pose_metrics import cheapest, plausible_diversity, true_pose_rank
 from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance, surface_points
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.settings import build_settings, settings_mapping
@@ -108,7 +108,7 @@ class HypothesisMetrics:
             "root": metrics.root,
         }
         if ranked and len(chosen) > 1:
-            row["rank"] = calibration(distance, chosen, self._truth).rank
+            row["rank"] = true_pose_rank(distance, chosen, self._truth)
         return row
 
     def nearest(self, problem: RegistrationProblem, found: Hypotheses) -> tuple[int, float]:

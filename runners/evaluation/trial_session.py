@@ -167,14 +167,13 @@ def make_session(plan: Plan, trial: Trial) -> None:
     settings, truth = plausible_settings_of(plan, session), session.world_from_object
     assert truth is not None
     steps, failures = [], {}
-    before: PlausibleSet | None = None
     for problem in problems(plan, trial, session):
         step = problem.key.step
         steps.append(step)
         if clean != trial or not plan.plausible:
             continue
         try:
-            before, _ = made_set(folder / "plausible", problem, truth, settings, before)
+            make_set(folder / "plausible", problem, truth, settings)
         except EvaluationError as error:
             failures[str(step)] = " ".join(str(error).split())
     told: dict[str, Any] = {"steps": steps, "no_plausible_set": failures}
@@ -245,20 +244,13 @@ def load_members(
     return found
 
 
-def made_set(
-    folder: Path,
-    problem: RegistrationProblem,
-    truth: FloatArray,
-    settings: PlausibleSettings,
-    before: PlausibleSet | None,
-) -> tuple[PlausibleSet, bool]:
-    """The set of a step, and whether it was there. before: that of the step before."""
-    found = load_plausible(folder, problem, settings, world_from_object=truth)
-    if found is not None:
-        return found, True
-    found = plausible_set(problem, truth, settings, survivors=before)
-    try:
-        save_plausible(folder, found)
-    except EvaluationError as error:
-        raise WritingError(str(error)) from error
-    return found, False
+def make_set(
+    folder: Path, problem: RegistrationProblem, truth: FloatArray, settings: PlausibleSettings
+) -> None:
+    """Make the set of a step unless it is there."""
+    if load_plausible(folder, problem, settings, world_from_object=truth) is None:
+        found = plausible_set(problem, truth, settings)
+        try:
+            save_plausible(folder, found)
+        except EvaluationError as error:
+            raise WritingError(str(error)) from error

@@ -112,10 +112,7 @@ def mark_rays(
     """
     regions = depth_regions(view.metres, usable, camera, gate.jump)
     ends, small = speckle_free(view.metres, view.valid, regions, gate.speckle)
-    if rig.rays == "scaled_images":
-        grid.scaled_images(ends, camera, view.world_from_camera, usable)
-    else:
-        grid.from_depth(ends, camera, view.world_from_camera, usable, fraction=rig.fraction)
+    grid.from_depth(ends, camera, view.world_from_camera, usable, fraction=rig.fraction)
     return small
 
 

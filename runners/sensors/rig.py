@@ -57,8 +57,6 @@ class CameraRig(CheckedSettings):
     are measured badly; null: all pixels count."""
 
     rate: Annotated[float | None, positive] = 2.0  # images a second at most; null: all
-    rays: Annotated[str, one_of("traversal", "scaled_images")] = "traversal"
-    """Traversal of every voxel, or the reference's scaled images."""
 
     views: Annotated[int, positive] = 1  # in so many images a voxel must have been seen to be free
     edge_reach: Annotated[int, positive] = 5  # pixels

@@ -24,8 +24,6 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import surface_points
 from chsel.problem.trust import trust_in
-from chsel.qd.archive import GridArchive
-from chsel.qd.measures import MEASURES
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
 from tests.chsel.kernel_files import kernel_files
@@ -69,8 +67,6 @@ def code() -> dict[str, str]:
     for name in ENOUGH:
         run(CASES[name], grid(CASES[name].body))
     decision_stages("bracket", grid("bracket"))
-    archive = GridArchive(MEASURES["position_2"], np.zeros(2), np.ones(2), bins=2, dimension=9)
-    archive.cells_of(np.zeros((1, 2)))
     where = scene(grid("bracket"), "bracket", ("contacts", "free"))
     key, first = StreamKey(11, 0), np.eye(4)[None]
     space, camera = FreeGrid(where.workspace, 0.05), PinholeCamera(4, 3, 5.0, 5.0, 2.0, 1.5)

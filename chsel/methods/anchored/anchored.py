@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from chsel.methods.anchor_sampling import AnchorSampler, most_informative_first
-from chsel.methods.anchored.anchored_settings import EFFORTS, AnchoredSettings
+from chsel.methods.anchor_sampling import AnchorSampler, AnchorSettings, most_informative_first
 from chsel.methods.anchored.energy import Energy
 from chsel.methods.anchored.fitting import fitted, twists_of
 from chsel.methods.anchored.modes import distinct, has_new_mode, near_symmetries
@@ -16,6 +15,7 @@ from chsel.methods.anchored.walking import Chains, stride_of, walked
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.problem.noise import NoiseModel, noise_model
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.outline import in_order
 from chsel.problem.poses import Poses, compose, product, rotated
 from chsel.problem.registration_problem import (
@@ -24,23 +24,14 @@ from chsel.problem.registration_problem import (
     Observer,
     RegistrationProblem,
 )
-from chsel.problem.search_space import origin_bounds, search_space
+from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
+from chsel.problem.settings import CheckedSettings, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose
-from chsel.problem.subset import (
-    evenly_spaced,
-    facilities,
-    farthest_poses,
-    squared_distances,
-)
+from chsel.problem.subset import evenly_spaced, facilities, farthest_poses, squared_distances
 from chsel.problem.surface import object_centre
 from chsel.qd.archive import Evaluated
 from chsel.qd.measures import measure_named
-from chsel.qd.selection import (
-    measure_range,
-    ranked,
-    repeated,
-    sized_archive,
-)
+from chsel.qd.selection import ArchiveSettings, ranked, repeated, sized_archive
 
 _MOST_ROUNDS = 12
 # While minima are sought, contacts and free voxels draw from far.
@@ -56,6 +47,88 @@ _MOST_KNOWN = 64  # points that poses are rated by, as more of them tell hardly 
 _LEAST_LEFT = 3  # contacts that poses are sampled on if one is left out
 _TWINNED = 12  # basins whose poses are turned by near symmetries
 _MOST_GIVEN = 60  # of E_0 and E_l that are fitted
+
+
+MOST_SAMPLES = 1_000_000_000
+MOST_POSES = 1_000_000
+MOST_MOVES = 100_000
+_ARCHIVE = ArchiveSettings(bins=40, outliers="none")
+_ONLINE = OnlineSettings(update="own")
+
+
+@dataclass(frozen=True)
+class Effort(CheckedSettings):
+    """How much is computed."""
+
+    samples: Annotated[int, positive, at_most(MOST_SAMPLES)] = 120_000  # poses drawn
+    kept: Annotated[int, positive, at_most(MOST_POSES)] = 200  # the best of them, which are fitted
+    first_steps: Annotated[int, not_negative, at_most(MOST_MOVES)] = 6  # of these fits
+    refined: Annotated[int, positive, at_most(MOST_POSES)] = 100  # of these, fitted further
+    steps: Annotated[int, not_negative, at_most(MOST_MOVES)] = 15  # of these fits
+    descents: Annotated[int, positive, at_most(MOST_POSES)] = 96  # chains that descend to the limit
+    descent_moves: Annotated[int, not_negative, at_most(MOST_MOVES)] = 266
+    chains: Annotated[int, positive, at_most(MOST_POSES)] = 96  # chains that spread below it
+    moves: Annotated[int, not_negative, at_most(MOST_MOVES)] = 300
+    # As many of the lowest, and of candidates far apart, are taken to their minima.
+    polished: Annotated[int, not_negative, at_most(MOST_POSES)] = 16
+    polish_moves: Annotated[int, not_negative, at_most(MOST_MOVES)] = 300
+    # How many evaluations may be spent in rounds of all stages up to the descent: a second one, and
+    # further ones while the last found a new mode; 0: one round.
+    evaluations: Annotated[int, not_negative, at_most(MOST_SAMPLES)] = 0
+
+
+_SMALL = Effort(
+    samples=40_000,
+    kept=64,
+    first_steps=10,
+    refined=40,
+    descents=24,
+    descent_moves=60,
+    chains=24,
+    moves=150,
+    polished=8,
+    polish_moves=200,
+)
+_LARGE = Effort(
+    samples=400_000,
+    kept=504,
+    refined=150,
+    descents=120,
+    descent_moves=500,
+    chains=120,
+    moves=1000,
+    polished=32,
+    polish_moves=1000,
+)
+EFFORTS = {
+    "small": _SMALL,
+    "medium": Effort(),
+    "large": _LARGE,
+    "adaptive": replace(_SMALL, chains=60, moves=400, evaluations=600_000),
+}
+
+
+@dataclass(frozen=True)
+class AnchoredSettings(CheckedSettings):
+    """All settings of the contact-anchored search, the same in all presets.
+
+    The method is neither in the paper nor in its authors' code.
+    """
+
+    size: Annotated[str, one_of(*EFFORTS)] = "adaptive"
+    effort: Effort | None = None  # in place of the one that `size` names
+    # Of the sensor, as in its data sheet: standard deviation of known points, metres. The noise
+    # that is estimated from the points is no less.
+    noise: Annotated[float, positive] = 0.0005
+    # Candidates have energies at most so much above the lowest, nats.
+    limit: Annotated[float, positive] = 9.0
+    # What contacts are off that no residual shows, metres: calibration of hand and camera, scale
+    # of the mesh.
+    shared_error: Annotated[float, not_negative] = 0.004
+    anchors: AnchorSettings = field(default_factory=AnchorSettings)
+    archive: ArchiveSettings = _ARCHIVE
+    online: OnlineSettings = _ONLINE
+    plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 
 
 class RatedPoses(NamedTuple):
@@ -80,15 +153,15 @@ class RatedPoses(NamedTuple):
 
 
 class Anchored(ConfiguredMethod[AnchoredSettings]):
-    """Samples anchored on contacts, fitted, spread below a limit, and a diverse choice of them."""
+    """Samples anchored on contacts, fitted, spread below a limit, and a diverse choice of them.
+
+    Costs are energies, nats.
+    """
 
     settings_class = AnchoredSettings
 
-    def register(
-        self, problem: RegistrationProblem, observer: Observer | None = None
-    ) -> Hypotheses:
-        """Hypotheses for the known points of a problem, best first; costs are energies, nats."""
-        search = Search(problem, self.settings, observer or NullObserver())
+    def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
+        search = Search(problem, self.settings, observer)
         return search.hypotheses(search.spread(search.minima()))
 
     def minima(self, problem: RegistrationProblem) -> Poses:
@@ -104,8 +177,7 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
         Those with an energy below the limit, beside the best hypothesis, where errors that points
         may share cost nothing.
         """
-        settings = self.settings
-        search = Search(problem, settings, NullObserver())
+        settings, search = self.settings, Search(problem, self.settings, NullObserver())
         energy = search.energy.by(noise_model(settings.noise, settings.shared_error))
         best = energy.of(Poses.of(hypotheses.object_from_world[:1]))
         return energy.of(Poses.of(object_from_world)) <= best[0] + settings.limit
@@ -251,15 +323,15 @@ class Search:
         measure = measure_named(settings.measure, planar=self._settings.plane is not None)
         vectors = space.encode(poses)
         offered = Evaluated(vectors, candidates.energies, measure.values(space, vectors))
-        mean, deviation = measure_range(offered, measure, settings, len(problem.points.known))
-        archive = sized_archive(measure, mean, deviation, settings, space.dimension)
-        archive.update_cells(offered)
+        known = len(problem.points.known)
+        archive = sized_archive(offered, measure, settings, known, space.dimension)
+        offers = archive.add(vectors, -candidates.energies, offered.measures)
         self._observer.snapshot(archive.snapshot(0, 0))
         last = archive.snapshot(0, 0)  # one of our own: an observer may change what it gets
         elites = space.poses(last.solutions)
-        cells = archive.cells_of(offered.measures[chosen])
         hypotheses = space.poses(vectors[chosen])
         energies = self.energy.of(hypotheses)
+        cells = offers.cells[chosen]
         found = ranked(hypotheses.matrices, energies, cells, elites.matrices, last)
         return replace(found, candidates=poses.matrices)
 
@@ -278,7 +350,9 @@ class Search:
         apart = squared_distances(sdf, candidates.poses[pool])
         energies = energies[pool]
         plausible = np.searchsorted(energies, energies + _REACH, side="right")
-        weights = coverage_weights(plausible)
+        # The chance of each to be drawn from the plausible set of a random true pose.
+        shares = np.bincount(plausible - 1, 1.0 / plausible, len(plausible))
+        weights = np.cumsum(shares[::-1])[::-1] / len(plausible)
         to_set = np.minimum.accumulate(apart, axis=1)[:, plausible - 1]
         prices = in_order(to_set) / (len(pool) * count)
         given = np.searchsorted(pool, modes)
@@ -288,12 +362,3 @@ class Search:
         vectors = self._space.encode(candidates.poses)
         self._observer.trace(stage, 0, vectors.copy(), candidates.energies.copy())
         self._observer.progress(stage, 1, 1)
-
-
-def coverage_weights(plausible: IntArray) -> FloatArray:
-    """The chance (C,) of each candidate to be drawn from the plausible set of a random true pose.
-
-    plausible (C,), rising: of each true pose, how many of the likeliest are plausible.
-    """
-    shares = np.bincount(plausible - 1, 1.0 / plausible, len(plausible))
-    return np.cumsum(shares[::-1])[::-1] / len(plausible)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_kernels import Model
 from chsel.cost.cost_settings import CostSettings
-from chsel.cost.free_kernels import is_apart, remember, travel
+from chsel.cost.free_kernels import is_apart, remember
 from chsel.numerics.arrays import FloatArray, scratch
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp, exps, log, logs
@@ -74,7 +75,7 @@ class Scratch(NamedTuple):
     """Of one thread."""
 
     near: NearPoints  # the free points gathered
-    memory: FloatArray  # (12,), where the object was then, see remember
+    memory: FloatArray  # (12,), where the object was then, see remember and travel
     sums: FloatArray  # (K,), of costs, then posterior weights
 
 
@@ -83,24 +84,18 @@ class Energy:
 
     def __init__(self, problem: RegistrationProblem, known: KnownPoints, noise: NoiseModel) -> None:
         """known: the problem's points, in the order in which they are looked up."""
-        self.known = known
-        cost = CompiledCost(
-            problem.sdf,
-            known,
-            CostSettings(penetration_tolerance=0.0),
-            free_resolution=problem.free_resolution,
-        )
-        self._cost, self._sdf = cost, problem.sdf
+        settings, side = CostSettings(penetration_tolerance=0.0), problem.free_resolution
+        self._cost = CompiledCost(problem.sdf, known, settings, free_resolution=side)
+        self._sdf, self._count = problem.sdf, len(known.known)
         self._set(noise)
 
     def _set(self, noise: NoiseModel) -> None:
         self.model: Model = self._cost.at_level(self._sdf, -noise.shared)
-        self.likelihood = likelihood_of(noise, len(self.known.known))
+        self.likelihood = likelihood_of(noise, self._count)
 
     def by(self, noise: NoiseModel) -> Energy:
         """The energy by another noise model."""
-        other = object.__new__(Energy)
-        other.known, other._cost, other._sdf = self.known, self._cost, self._sdf
+        other = copy(self)
         other._set(noise)
         return other
 
@@ -248,12 +243,6 @@ def gather_free(model, pose, slack, work):
 
 
 @leaf
-def travel_since_gathering(model, pose, work):
-    """How far in the world any point of the object moved at most since then, metres."""
-    return travel(model.free, pose, work.memory)
-
-
-@leaf
 def look_around(model, pose, work):
     """Fill hits with those gathered that may cost something at a pose; returns how many."""
     free, points = model.free, work.near
@@ -277,10 +266,7 @@ def free_point(model, work, n):
 
 @leaf
 def place_of(model, pose, point):
-    """Where a point of the world lies in the grid: the lowest node of its cell, or -1.
-
-    With the fractions u, v, w of the cell's sides. -1: where free points cost nothing.
-    """
+    """The lowest node of a world point's cell, -1 where free points cost nothing, and fractions."""
     box = model.field.box
     first, last, most, inverse = box.first, box.last, box.most, box.inverse
     x, y, z = moved(pose, point[0], point[1], point[2])

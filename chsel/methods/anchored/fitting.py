@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from chsel.cost.free_kernels import travel
 from chsel.methods.anchored.energy import (
     Energy,
     Scratch,
@@ -22,7 +23,6 @@ from chsel.methods.anchored.energy import (
     known_slope,
     look_around,
     place_of,
-    travel_since_gathering,
 )
 from chsel.numerics.arrays import FloatArray, scratch
 from chsel.numerics.cell_set import triple
@@ -110,7 +110,7 @@ def _fitted(model, likelihood, twists, pose, steps, fit):
         if not _solve(fit, damping * trace / dimension + 1e-12):
             break
         trial = _moved_by(twists, pose, fit)
-        if travel_since_gathering(model, trial, fit.work) > _SLACK:
+        if travel(model.free, trial, fit.work.memory) > _SLACK:
             gather_free(model, trial, _SLACK, fit.work)
         known = known_energy(model, likelihood, trial, energy, fit.work.sums)
         tried, costs = energy_below(model, likelihood, trial, known, energy, fit.work)

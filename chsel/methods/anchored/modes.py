@@ -69,26 +69,26 @@ def near_symmetries(sdf: SdfGrid) -> FloatArray:
 
     None is the identity; derived once.
     """
-    return sdf.derived("near symmetries", lambda: _near_symmetries(sdf))
 
+    def make() -> FloatArray:
+        if not has_surface(sdf):
+            return np.zeros((0, 4, 4))
+        surface, identity, key = outline_in_object(sdf), np.eye(4)[None], StreamKey(0, 0)
+        around = Workspace(tuple(sdf.bounds[0]), tuple(sdf.bounds[1]))
+        problem = RegistrationProblem(
+            sdf, KnownPoints(known=surface), identity, around, sdf.resolution, key
+        )
+        centre, space = object_centre(sdf), SE3Space()
+        energy = Energy(problem, problem.points, noise_model(FAR))
+        turns = random_rotations(key.stream(Purpose.MESH_SAMPLES, 1), _TURNS)
+        turned = Poses.of(compose(turns, centre - rotated(turns, centre)))
+        best = np.argsort(energy.of(turned), kind="stable")[:_FITTED]
+        fits = fitted(energy, twists_of(space, centre), turned[best], _STEPS)
+        same = Poses.of(identity)
+        moved = outline_distances_to(sdf, fits, same)
+        order = np.argsort(moved, kind="stable")
+        order = order[moved[order] <= _ALIKE * sdf.diameter]
+        poses = Poses.joined([same, fits[order]])
+        return poses[distinct(sdf, poses, _MOST + 1, np.inf)[1:]].matrices
 
-def _near_symmetries(sdf: SdfGrid) -> FloatArray:
-    if not has_surface(sdf):
-        return np.zeros((0, 4, 4))
-    surface, identity, key = outline_in_object(sdf), np.eye(4)[None], StreamKey(0, 0)
-    around = Workspace(tuple(sdf.bounds[0]), tuple(sdf.bounds[1]))
-    problem = RegistrationProblem(
-        sdf, KnownPoints(known=surface), identity, around, sdf.resolution, key
-    )
-    centre, space = object_centre(sdf), SE3Space()
-    energy = Energy(problem, problem.points, noise_model(FAR))
-    turns = random_rotations(key.stream(Purpose.MESH_SAMPLES, 1), _TURNS)
-    turned = Poses.of(compose(turns, centre - rotated(turns, centre)))
-    best = np.argsort(energy.of(turned), kind="stable")[:_FITTED]
-    fits = fitted(energy, twists_of(space, centre), turned[best], _STEPS)
-    same = Poses.of(identity)
-    moved = outline_distances_to(sdf, fits, same)
-    order = np.argsort(moved, kind="stable")
-    order = order[moved[order] <= _ALIKE * sdf.diameter]
-    poses = Poses.joined([same, fits[order]])
-    return poses[distinct(sdf, poses, _MOST + 1, np.inf)[1:]].matrices
+    return sdf.derived("near symmetries", make)

@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from chsel.cost.free_kernels import travel
 from chsel.methods.anchored.energy import (
     Energy,
     Scratch,
     energy_below,
     gather_free,
     known_energy,
-    travel_since_gathering,
 )
 from chsel.methods.anchored.fitting import moved_about
 from chsel.numerics.arrays import FloatArray, scratch
@@ -82,12 +82,8 @@ def walked(
     floor: the energy that they come down to, or stay below, see walk_below. kept: states of each.
     """
     count, model, likelihood = len(poses), energy.model, energy.likelihood
-    chains = Chains(
-        np.array(poses.numbers),
-        np.array(energies),
-        np.zeros((count, kept, 12)),
-        np.full((count, kept), np.inf),
-    )
+    states = np.zeros((count, kept, 12)), np.full((count, kept), np.inf)
+    chains = Chains(np.array(poses.numbers), np.array(energies), *states)
 
     def own() -> tuple[Scratch, Any]:
         return energy.scratch(), scratch(_MOVES * _DRAWS + 16, dtype=np.float32)
@@ -124,7 +120,7 @@ def walk_below(model, likelihood, stride, floor, chains, stream, moves, first, l
                 total = known_energy(model, likelihood, trial, limit, work.sums)
                 if total <= limit:
                     wanted = _slack_for(size)
-                    far = slack < 0.0 or travel_since_gathering(model, trial, work) > slack
+                    far = slack < 0.0 or travel(model.free, trial, work.memory) > slack
                     if far or slack > _TOO_MUCH * wanted:
                         slack = wanted
                         gather_free(model, trial, slack, work)

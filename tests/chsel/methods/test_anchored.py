@@ -12,8 +12,7 @@ import trimesh
 from chsel.errors import ChselError
 from chsel.methods import build_method, trust_by
 from chsel.methods.anchor_sampling import AnchorSampler
-from chsel.methods.anchored.anchored import Anchored, Search
-from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
+from chsel.methods.anchored.anchored import Anchored, AnchoredSettings, Effort, Search
 from chsel.methods.anchored.modes import distinct
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry

@@ -80,7 +80,7 @@ def runs_on(
     kind: int, settings: CmaEsSettings, starts: FloatArray, observer: Observer | None = None
 ) -> list[Run]:
     key, observer = StreamKey(0, 0), observer or NullObserver()
-    return run_all(objective(kind), starts, len(starts), settings, key, observer)
+    return run_all(objective(kind), starts, settings, key, observer)
 
 
 # Median evaluations of cma 4.5.0 over 21 seeds, population 10 and positive weights, until a cost

@@ -13,6 +13,7 @@ from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
 from chsel.methods import cvo, preset_settings
 from chsel.methods.cvo import (
     Ascent,
+    ClassTerm,
     Cvo,
     CvoSettings,
     Kernel,
@@ -52,10 +53,9 @@ def scene(count: int = 60) -> KnownPoints:
 
 def product_of(points: KnownPoints, kernel: Kernel, sdf: SdfGrid = SDF) -> Product:
     """The inner product by fields, with a surface band of a voxel."""
-    band = sdf.resolution
-    free = class_field(sdf, kernel, band, "free")
-    surface = class_field(sdf, kernel, band, "surface")
-    return free.term(points.free, 1.0), surface.term(points.contacts, 1.0)
+    parts = ("free", points.free), ("surface", points.contacts)
+    fields = {name: class_field(sdf, kernel, sdf.resolution, name) for name, _ in parts}
+    return tuple(ClassTerm(part.T.copy(), fields[name]) for name, part in parts)
 
 
 def labels(free: int, surface: int) -> FloatArray:
@@ -228,7 +228,7 @@ def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion() -> None:
     gains = []
     for start in nearby(8, 6):
         before = value(product, start)
-        climbers = climbers_at(Poses.of(start[None]).numbers, np.array([before]))
+        climbers = climbers_at(product, Poses.of(start[None]).numbers)
         climb(product, ASCENT, climbers, 1, 0, 1, None)
         xi, _ = direction(product, start)
         b, c, d, e = dense.quartic(start, xi)
@@ -244,8 +244,7 @@ def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion() -> None:
 
 def test_the_inner_product_never_falls_and_is_that_of_the_pose() -> None:
     product, starts = product_of(scene(), KERNEL), nearby(5, 7, 0.2)
-    poses = Poses.of(starts).numbers
-    climbers = climbers_at(poses, values_of(product, poses))
+    climbers = climbers_at(product, Poses.of(starts).numbers)
     for _ in range(30):
         before = climbers.value.copy()
         climb(product, ASCENT, climbers, 1, 0, 5, None)
@@ -463,7 +462,7 @@ def test_a_coarser_field_stands_for_a_fine_grid_all_the_same() -> None:
     points, transforms = scene(60), nearby(4, 5)
     dense = DenseClouds.of(fine, points, fine.resolution)
     product = product_of(points, KERNEL, fine)
-    assert product[0].box.inverse == pytest.approx(1.0 / 0.008)
+    assert product[0].field.box.inverse == pytest.approx(1.0 / 0.008)
     expected = np.array([dense.product(transform) for transform in transforms])
     most = dense.product(np.eye(4))
     np.testing.assert_allclose(values(product, transforms), expected, rtol=0, atol=0.002 * most)
@@ -480,9 +479,7 @@ def pair_sum(points: FloatArray) -> float:
 @pytest.mark.parametrize("count", [50, 2100])
 def test_the_norm_of_a_cloud_is_the_sum_over_its_pairs(count: int) -> None:
     points = np.random.default_rng(0).uniform(-0.2, 0.3, (count, 3))
-    expected = pair_sum(points)
-    tolerance = 1e-12 if count == 50 else 0.002
-    assert cloud_norm(points, KERNEL, 0.01) == pytest.approx(expected, tolerance)
+    assert cloud_norm(points, KERNEL, 0.01) == pytest.approx(pair_sum(points), 1e-12)
 
 
 def test_the_norm_of_lattice_points_is_that_of_a_field_at_its_nodes() -> None:
@@ -490,12 +487,6 @@ def test_the_norm_of_lattice_points_is_that_of_a_field_at_its_nodes() -> None:
     points = (lattice * 0.0228)[np.random.default_rng(0).random(len(lattice)) < 0.9] + 0.1234
     found = cloud_norm(points, KERNEL, 0.0228)
     assert found == pytest.approx(pair_sum(points), 1e-3)
-
-
-def test_points_all_over_the_world_are_summed_one_by_one() -> None:
-    points = np.random.default_rng(0).uniform(-0.2, 0.2, (2100, 3))
-    points[0] = 1e6
-    assert cloud_norm(points, KERNEL, 0.01) == pytest.approx(pair_sum(points), 1e-9)
 
 
 @pytest.mark.parametrize("spacing", [0.01, 0.0228])
@@ -507,9 +498,9 @@ def test_a_cube_of_points_is_as_good_as_its_points(spacing: float) -> None:
     assert len(alone) + side**3 * len(centres) == len(points)
     assert len(alone) < 0.6 * len(points)
     field = class_field(SDF, KERNEL, 0.01, "free")
-    all_alone = (field.term(points, 1.0),)
-    cubes = class_field(SDF, wide, 0.01, "free").term(centres, 1.0)
-    with_cubes = field.term(alone, 1.0), cubes
+    all_alone = (ClassTerm(points.T.copy(), field),)
+    cubes = ClassTerm(centres.T.copy(), class_field(SDF, wide, 0.01, "free"))
+    with_cubes = ClassTerm(alone.T.copy(), field), cubes
     transforms = nearby(5, 2)
     expected, wanted = values(all_alone, transforms), flow(all_alone, transforms)
     np.testing.assert_allclose(values(with_cubes, transforms), expected, rtol=1e-3)

@@ -138,8 +138,8 @@ def test_what_is_beyond_the_workspace_is_not_free() -> None:
     expected = medial_balls(centres(voxels[voxels[:, 0] <= 4]), WORKSPACE, SIDE, 0.02)
     np.testing.assert_array_equal(found.centres, expected.centres)
     far = Workspace((3.0, 3.0, 3.0), (4.0, 4.0, 4.0))
-    assert len(medial_balls(centres(voxels), far, SIDE, 0.02)) == 0
-    assert len(medial_balls(np.zeros((0, 3)), WORKSPACE, SIDE, 0.02)) == 0
+    for points, where in ((centres(voxels), far), (np.zeros((0, 3)), WORKSPACE)):
+        assert len(medial_balls(points, where, SIDE, 0.02).radii) == 0
 
 
 def test_points_over_too_many_voxels_are_an_error_that_says_so() -> None:
@@ -239,7 +239,7 @@ def test_the_true_pose_among_balls_of_its_own_free_space_costs_almost_nothing() 
     lattice = 0.025 * np.indices((21, 21, 21)).reshape(3, -1).T - 0.25
     free = lattice[np.sqrt((lattice**2).sum(axis=1)) > RADIUS + 0.025]
     cost = MedialCost(problem(KnownPoints(free=free, known=[[RADIUS, 0.0, 0.0]])))
-    assert len(cost.balls) > 100
+    assert len(cost.balls.radii) > 100
     away = compose(np.eye(3)[None], np.array([[0.05, 0.0, 0.0]]))
     assert cost.evaluate(IDENTITY)[0] < 1e-7
     assert cost.evaluate(Poses.of(away))[0] > 1e-4

@@ -169,7 +169,7 @@ def test_problems_of_any_size_are_decided(name: str, case: str) -> None:
         (lambda: Belief(at((0.0, 0.0, 0.0)), np.array([0.9])), SettingError, "a distribution"),
         (lambda: along_x([(0.0, 0.0)], length=0.0), SettingError, "length of actions has 0.0"),
         (lambda: HandShape(np.zeros((3, 3)), [[0, 1, 3]]), SettingError, "has no faces"),
-        (lambda: HandShape(np.eye(3) * 50.0, [[0, 1, 2]]), SettingError, "the hand is 50 m wide"),
+        (lambda: HandShape(np.eye(3) * 50.0, [[0, 1, 2]]), SettingError, "the hand reaches 50 m"),
         (lambda: replace(some_problem(1, 2, 0.1), free_resolution=0.0), SettingError, "free_res"),
     ],
 )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from chsel.errors import EvaluationError, SettingError
+from chsel.errors import SdfError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.plausible.evaluation_cost import EvaluationCost
@@ -21,13 +21,11 @@ from chsel.plausible.plausible_set import (
     stepped,
 )
 from chsel.plausible.plausible_settings import (
-    DEFINITIONS,
     EvaluationCostSettings,
     ModeSearchSettings,
     Offsets,
     PlausibleSettings,
     PoseGridSettings,
-    plausible_settings,
 )
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse
@@ -164,18 +162,7 @@ def test_modes_take_the_places_of_others_where_there_are_too_many() -> None:
     np.testing.assert_array_equal(found.truth, np.eye(4))
 
 
-def test_sets_keep_their_names() -> None:
-    """As files and evaluations of before are found by this digest."""
-    digests = {name: plausible_settings(name, 0.001).digest for name in DEFINITIONS}
-    assert digests == {
-        "default": "9e9d529fee8cd42535e67929c57c0075",
-        "paper": "bf832c1245e3394032873ce1e366283b",
-        "reference": "d721b4c2811b591fa041b54762af51d0",
-        "wide_means": "cc5bc72edea18cb43dd72805b873c3c2",
-        "wide_means_10mm": "220767fd151ae03a35da706bdcb0faa8",
-        "wide_sums": "7fc3f2378e9ee80e910331c0c63575a6",
-    }
-    assert "modes" not in PLAIN.text
+def test_settings_of_the_search_are_part_of_the_definition() -> None:
     others = [SEARCH, replace(SEARCH, modes=ModeSearchSettings(31)), PLAIN]
     assert len({one.digest for one in others}) == 3
     assert build_settings(PlausibleSettings, settings_mapping(SEARCH), "definition") == SEARCH
@@ -199,7 +186,7 @@ def test_an_object_without_a_surface_is_one_clear_error() -> None:
     sdf, known = problem.sdf, problem.points.known
     lifted = SdfGrid(sdf.origin, sdf.resolution, sdf.values + 0.15, sdf.gradients)
     points = KnownPoints(known=known, known_sdf=np.full(len(known), 0.15))
-    with pytest.raises(EvaluationError, match="modes cannot be distinguished: no node"):
+    with pytest.raises(SdfError, match="no node"):
         plausible_set(replace(problem, sdf=lifted, points=points), np.eye(4), SEARCH)
 
 

@@ -186,20 +186,9 @@ def test_the_set_shrinks_as_more_is_known_of_sums() -> None:
         found = plausible_set(known, truth, by)
         if before is not None:
             assert set(found.index) <= set(before.index)
-            pruned = plausible_set(known, truth, replace(by, rescan=False), survivors=before)
-            np.testing.assert_array_equal(pruned.index, found.index)
-            np.testing.assert_array_equal(pruned.index_cost, found.index_cost)
         sizes.append(len(found.index))
         before = found
     assert sizes[0] > sizes[1] > sizes[2] > 0
-
-
-def test_survivors_of_another_grid_are_refused() -> None:
-    problem, truth = touched_box()
-    before = plausible_set(problem, truth, BOX)
-    other = replace(BOX, grid=SMALL, rescan=False)
-    with pytest.raises(EvaluationError, match="survivors are of another grid"):
-        plausible_set(problem, truth, other, survivors=before)
 
 
 def test_a_symmetry_of_the_object_is_found() -> None:
@@ -306,12 +295,8 @@ def plausible_rotation(by: PlausibleSettings, seed: int) -> FloatArray:
     ("make", "message"),
     [
         (lambda: PlausibleSettings(epsilon=0.0), "epsilon is 0.0"),
-        (lambda: PlausibleSettings(fill_to=50, members=40), "fill_to is 50"),
-        (lambda: Offsets(x=()), "x has no piece"),
-        (lambda: Offsets(y=((0.0, np.inf, 3),)), "y has the piece"),
-        (lambda: Offsets(z=((0.0, 0.1, 0),)), "z has the piece"),
+        (lambda: Offsets(z=((0.0, 0.1, 0),)), "offsets are .15, 15, 0. along x, y and z"),
         (lambda: Offsets(z=((0.0, 0.1, 10**6),)), "the number of offsets"),
-        (lambda: PoseGridSettings(rotations=50, extra="replaced"), "rotations is 50"),
         (lambda: EvaluationCostSettings("medians"), "combine is 'medians'"),
         (lambda: plausible_settings("mine", 0.001), "'mine'"),
     ],
@@ -359,9 +344,6 @@ def test_a_set_is_read_as_it_was_written_and_named_by_its_points(
     assert (read.settings, read.seed) == (SETTINGS, 7)
     assert read.true_cost == found.true_cost
     np.testing.assert_array_equal(read.truth, truth)
-    with np.load(path, allow_pickle=False) as arrays:
-        assert float(arrays["epsilon"]) == 0.02
-        np.testing.assert_array_equal(arrays["true_pose"], truth)
 
 
 def test_other_points_definitions_and_seeds_have_files_of_their_own(
@@ -384,13 +366,8 @@ def test_other_points_definitions_and_seeds_have_files_of_their_own(
     assert plausible_path(tmp_path, later, SETTINGS) == path
 
 
-def test_a_file_under_the_wrong_name_is_refused(made: Made, tmp_path: Path) -> None:
+def test_a_set_around_another_true_pose_is_refused(made: Made, tmp_path: Path) -> None:
     problem, truth, found = made
-    path = save_plausible(tmp_path, found)
-    more = replace(problem, points=problem.points.merged(problem.points))
-    path.rename(plausible_path(tmp_path, more, SETTINGS))
-    with pytest.raises(EvaluationError, match="belongs to another known points"):
-        load_plausible(tmp_path, more, SETTINGS)
     save_plausible(tmp_path, found)
     moved = truth.copy()
     moved[0, 3] += 0.001
@@ -405,8 +382,7 @@ def test_what_was_changed_after_it_was_written_is_refused(made: Made, tmp_path: 
         arrays = dict(archive)
     for name, value, message in [
         ("cost", arrays["cost"] * 2.0, "does not hold what was written"),
-        ("format", np.array(99), "format 99"),
-        ("world_from_object", arrays["world_from_object"] * 2.0, "not a rigid transform"),
+        ("settings", np.array("["), "damaged or not a plausible set"),
         ("cost", np.array([object()]), "damaged"),
     ]:
         np.savez(path.open("wb"), **{**arrays, name: value})

@@ -13,7 +13,6 @@ from scipy.optimize import brentq
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.symmetry import (
     ObjectSymmetry,
-    RotatedSurface,
     generated,
     grid_symmetry,
     object_symmetry,
@@ -225,17 +224,6 @@ def test_a_mesh_without_an_area_has_no_symmetry(vertices: list[list[float]]) -> 
     found = object_symmetry(trimesh.Trimesh(vertices, [[0, 1, 2]], process=False))
     assert_same_set(found.rotations, np.eye(3)[None])
     np.testing.assert_allclose(found.centre, [1.0, 2.0, 3.0])
-
-
-def test_a_mesh_of_a_million_faces_is_merged_first() -> None:
-    mesh = trimesh.creation.box((0.1, 0.2, 0.3))
-    for _ in range(8):
-        mesh = mesh.subdivide()
-    assert len(mesh.faces) > 700_000
-    assert len(RotatedSurface(mesh).areas) < 200_000
-    found = object_symmetry(mesh)
-    assert len(found.rotations) == 4
-    np.testing.assert_allclose(found.centre, 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("name", "count"), SCANS.items())

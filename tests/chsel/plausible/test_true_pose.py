@@ -89,5 +89,5 @@ def test_what_cannot_be_searched_is_named() -> None:
     problem, _ = scene(np.random.default_rng(3), box(HALF))
     with pytest.raises(PoseError, match="guess"):
         find_true_pose(problem, np.ones((4, 4)))
-    with pytest.raises(SettingError, match="spacing is"):
-        TruePoseSettings(spacing=0.001)
+    with pytest.raises(SettingError, match="the number of offsets is"):
+        find_true_pose(problem, np.eye(4), TruePoseSettings(spacing=0.001))

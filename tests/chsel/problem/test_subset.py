@@ -39,8 +39,9 @@ def squared_distances(points: FloatArray, chosen: IntArray) -> FloatArray:
 def test_descriptors_differ_about_as_much_as_surfaces_do() -> None:
     poses = transforms(30)
     surface = surface_points(GRID, 2000, StreamKey(0, 0).stream(Purpose.METRIC_POINTS))
-    settings = DistanceSettings(len(surface), "grid", bidirectional=True)
+    settings = DistanceSettings(len(surface), "grid")
     apart = SurfaceDistance(GRID, None, surface, settings).between(poses, inverse(poses))
+    apart = (apart + apart.T) / 2.0
     descriptors = surface_descriptors(GRID, Poses.of(poses))
     squares = ((descriptors[:, None] - descriptors[None]) ** 2).mean(axis=2) * SQUARE_MILLIMETRES
     near = (apart > 1.0) & (apart < 400.0)

@@ -11,6 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from chsel.errors import ChselError
+from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.qd.archive import GridArchive, rank, sampled_cell
 from chsel.qd.measures import MEASURES, VECTOR, Measure, MeasureCode
 
@@ -27,22 +28,27 @@ def archive() -> GridArchive:
     return GridArchive(XY, np.array([0.0, -1.0]), np.array([1.0, 1.0]), bins=4, dimension=2)
 
 
+def cells_of(archive: GridArchive, measures: FloatArray) -> IntArray:
+    return archive.add(measures, np.zeros(len(measures)), measures).cells
+
+
 def add(archive: GridArchive, measures: list[list[float]], objectives: list[float]):  # type: ignore[no-untyped-def]
-    return archive.add(np.array(measures), np.array(objectives), np.array(measures))
+    batch = archive.add(np.array(measures), np.array(objectives), np.array(measures))
+    return batch.status, batch.value
 
 
 def test_cells_are_row_major_with_the_last_measure_fastest(archive: GridArchive) -> None:
-    cells = archive.cells_of(np.array([[0.1, -0.9], [0.1, 0.9], [0.9, -0.9], [0.3, 0.1]]))
+    cells = cells_of(archive, np.array([[0.1, -0.9], [0.1, 0.9], [0.9, -0.9], [0.3, 0.1]]))
     np.testing.assert_array_equal(cells, [0, 3, 12, 6])
 
 
 def test_measures_outside_of_the_range_go_to_the_cells_at_its_edge(archive: GridArchive) -> None:
-    cells = archive.cells_of(np.array([[-9.0, -9.0], [9.0, 9.0], [-9.0, 0.1], [1.0, 1.0]]))
+    cells = cells_of(archive, np.array([[-9.0, -9.0], [9.0, 9.0], [-9.0, 0.1], [1.0, 1.0]]))
     np.testing.assert_array_equal(cells, [0, 15, 2, 15])
 
 
 def test_a_measure_on_a_border_belongs_to_the_cell_above(archive: GridArchive) -> None:
-    np.testing.assert_array_equal(archive.cells_of(np.array([[0.25, 0.0]])), [6])
+    np.testing.assert_array_equal(cells_of(archive, np.array([[0.25, 0.0]])), [6])
 
 
 def test_status_and_value_are_against_the_archive_before_the_batch(archive: GridArchive) -> None:
@@ -88,12 +94,11 @@ def test_numbers_that_are_not_finite_never_enter(
     measures, objectives = solutions.copy(), np.array([-1.0, -2.0])
     target = {"solution": solutions, "objective": objectives, "measure": measures}[where]
     target.reshape(2, -1)[1, -1] = bad
-    status, value = archive.add(solutions, objectives, measures)
-    np.testing.assert_array_equal(status, [2, 0])
-    np.testing.assert_array_equal(value, [-1.0, -np.inf])
+    batch = archive.add(solutions, objectives, measures)
+    np.testing.assert_array_equal(batch.status, [2, 0])
+    np.testing.assert_array_equal(batch.value, [-1.0, -np.inf])
+    np.testing.assert_array_equal(batch.cells, [0, -1])
     np.testing.assert_array_equal(archive.occupied, [0])
-    if where == "measure":
-        np.testing.assert_array_equal(archive.cells_of(measures), [0, -1])
 
 
 def test_snapshot_is_a_copy_with_its_statistics(archive: GridArchive) -> None:
@@ -114,7 +119,7 @@ def test_angles_across_half_a_turn_stay_neighbours() -> None:
     assert deviation[0] == pytest.approx(np.sqrt((0.02**2 + 0.01**2) / 2), rel=1e-3)
     archive = GridArchive(angle, mean - 0.04, mean + 0.04, bins=8, dimension=1)
     order = np.argsort([-0.02, 0.02, -0.01, 0.01])
-    cells = archive.cells_of(values)[order]
+    cells = cells_of(archive, values)[order]
     np.testing.assert_array_equal(cells, [2, 3, 5, 6])
 
 
@@ -176,8 +181,9 @@ def test_insertion_is_that_of_a_plain_loop(circular: bool, batches: list[list[So
         measures = np.array([solution[0] for solution in batch])
         objectives = np.array([solution[1] for solution in batch])
         serial = np.arange(len(batch))[:, None]  # tells equal solutions apart
-        status, value = archive.add(np.hstack([serial, measures]), objectives, measures)
-        assert list(zip(status.tolist(), value.tolist(), strict=True)) == plain.add(batch)
+        offers = archive.add(np.hstack([serial, measures]), objectives, measures)
+        found = zip(offers.status.tolist(), offers.value.tolist(), strict=True)
+        assert list(found) == plain.add(batch)
     assert archive.occupied.tolist() == sorted(plain.best)
     snapshot = archive.snapshot(0, 0)
     for i, cell in enumerate(sorted(plain.best)):

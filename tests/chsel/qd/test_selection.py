@@ -16,7 +16,6 @@ from chsel.qd.measures import MEASURES
 from chsel.qd.selection import (
     ArchiveSettings,
     OutputSettings,
-    measure_range,
     repeated,
     select_elites,
     sized_archive,
@@ -93,8 +92,7 @@ def test_noise_limit_is_lowest_plus_tolerance_where_that_is_larger() -> None:
 def archive_of(values: FloatArray, costs: FloatArray, settings: ArchiveSettings) -> GridArchive:
     """The archive that estimates of such measures (B, 2) and costs (B,) size."""
     measure, estimates = MEASURES["position_2"], Evaluated(np.zeros((len(costs), 9)), costs, values)
-    mean, deviation = measure_range(estimates, measure, settings, known_count=5)
-    return sized_archive(measure, mean, deviation, settings, dimension=9)
+    return sized_archive(estimates, measure, settings, known_count=5, dimension=9)
 
 
 @pytest.mark.parametrize(("outliers", "kept"), [("none", 5), ("ratio", 3), ("quantile", 4)])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from chsel.errors import PointsError, SettingError
 from chsel.sensing.depth_camera import (
@@ -35,10 +34,10 @@ def test_points_project_back_onto_their_pixels() -> None:
     [
         ((0, 3, 1.0, 1.0, 0.0, 0.0), "camera width is 0; accepted"),
         ((4, 3.5, 1.0, 1.0, 0.0, 0.0), "camera height is 3.5; accepted: a whole number"),
-        ((4, 10**9, 1.0, 1.0, 0.0, 0.0), "camera height is 1000000000; accepted: at most 100_000"),
+        ((4, 10**9, 1.0, 1.0, 0.0, 0.0), "camera height is 1000000000; accepted: .* to 100_000"),
         ((4, 3, 0.0, 1.0, 0.0, 0.0), "camera fx is 0.0; accepted"),
         ((4, 3, 1.0, float("nan"), 0.0, 0.0), "camera fy is nan; accepted"),
-        ((4, 3, 1.0, 1.0, float("inf"), 0.0), "camera cx is inf; accepted: a finite number"),
+        ((4, 3, 1.0, 1.0, float("inf"), 0.0), "camera cx, cy are inf, 0.0; accepted: finite"),
     ],
 )
 def test_what_no_camera_has_is_refused(values: tuple[float, ...], message: str) -> None:
@@ -85,20 +84,6 @@ def test_a_longer_reach_looks_across_a_gap() -> None:
     assert not occlusion_edges(depth, valid, 0.05).any()
     across = occlusion_edges(depth, valid, 0.05, reach=2)
     np.testing.assert_array_equal(np.flatnonzero(across.any(axis=0)), [3, 5])
-
-
-@pytest.mark.parametrize(("shape", "reach"), [((40, 57), 5), ((40, 57), 2), ((3, 4), 9)])
-def test_edges_are_those_of_the_filters_of_scipy(shape: tuple[int, int], reach: int) -> None:
-    stream = np.random.default_rng(reach)
-    depth, valid = stream.random(shape), stream.random(shape) < 0.8
-    depth[~valid] = np.nan
-    nearest = minimum_filter(np.where(valid, depth, np.inf), 2 * reach + 1, mode="nearest")
-    furthest = maximum_filter(np.where(valid, depth, -np.inf), 2 * reach + 1, mode="nearest")
-    jumps = np.maximum(furthest - depth, depth - nearest)
-    limit = float(np.quantile(jumps[valid], 0.5))
-    expected = valid & (jumps > limit)
-    assert 0 < expected.sum() < valid.sum()
-    np.testing.assert_array_equal(occlusion_edges(depth, valid, limit, reach=reach), expected)
 
 
 TELE = PinholeCamera(60, 40, 600.0, 600.0, 29.5, 19.5)

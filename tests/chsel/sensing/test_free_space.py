@@ -17,7 +17,6 @@ from chsel.problem.points import FreeVoxels, Lattice, Workspace
 from chsel.problem.poses import apply, axis_angle, compose, inverse, rotated
 from chsel.sensing.depth_camera import PinholeCamera
 from chsel.sensing.free_space import (
-    SCALES,
     FreeGrid,
     MarkedVoxels,
     interior_lattice,
@@ -148,22 +147,6 @@ def test_the_number_of_threads_changes_nothing(
     np.testing.assert_array_equal(free.new(), alone.new())
 
 
-def test_scaled_images_are_points_on_the_rays_with_gaps_between(
-    image: tuple[FloatArray, BoolArray],
-) -> None:
-    depth, mask = image
-    scaled, traversed = grid(), grid()
-    fresh = scaled.scaled_images(depth, CAMERA, POSE, mask)
-    traversed.from_depth(depth, CAMERA, POSE, mask, fraction=0.95 + 1e-9)
-    points = np.concatenate([CAMERA.back_project(scale * depth)[mask] for scale in SCALES])
-    points = rotated(POSE[:3, :3], points[np.isfinite(points).all(axis=1)]) + POSE[:3, 3]
-    plain = grid()
-    assert plain.at(points) == fresh
-    found = voxels(scaled.new())
-    assert found == voxels(plain.new())
-    assert found < voxels(traversed.new())
-
-
 def test_voxels_are_free_once_enough_views_saw_them() -> None:
     free = grid(views=3)
     eye = [0.0, 0.0, 0.4]
@@ -191,7 +174,7 @@ def test_shapes_and_poses_that_do_not_fit_are_refused(image: tuple[FloatArray, B
     with pytest.raises(PointsError, match=r"depth has shape \(64, 48\); accepted: \(48, 64\)"):
         free.from_depth(depth.T, CAMERA, POSE, mask)
     with pytest.raises(PointsError, match=r"mask has shape \(48,\)"):
-        free.scaled_images(depth, CAMERA, POSE, mask[:, 0])
+        free.from_depth(depth, CAMERA, POSE, mask[:, 0])
     with pytest.raises(PoseError, match="world_from_camera"):
         free.from_depth(depth, CAMERA, 2.0 * POSE, mask)
     with pytest.raises(PointsError, match=r"ends has shape \(5, 2\)"):

@@ -244,15 +244,9 @@ def test_contacts_that_a_rig_adds_must_be_finite_and_within_the_workspace(log: P
     assert "probe 1: a contact that the rig adds is left out, as it is out of" in lines(events)
 
 
-def test_the_references_ways_tell_less(log: Path, events: list[Any]) -> None:
+def test_free_space_of_a_hand_that_is_swept_backwards(log: Path) -> None:
     assert RIG.hand is not None
-    scaled = replace(RIG.cameras[0], rays="scaled_images")
-    backwards = replace(RIG.hand, sweep="backwards")
-    rig = replace(RIG, cameras=(scaled,), hand=backwards)
-    found = probes(open_log(log, rig).probes())
-    both = [sum(len(p.new_points.free) for p in some) for some in (found, probes(events))]
-    assert 0.3 * both[1] < both[0] < both[1]
-    rig = replace(RIG, cameras=(), hand=backwards)
+    rig = replace(RIG, cameras=(), hand=replace(RIG.hand, sweep="backwards"))
     free = probes(open_log(log, rig).probes())[0].new_points.free
     end = hand_pose(2.0)[:3, 3] + [HAND_FROM_PAD[2, 3] + MEMBRANE, 0.0, 0.0]
     behind = end[0] - free[:, 0]
