@@ -356,8 +356,8 @@ def load_plausible(
 ) -> PlausibleSet | None:
     """The set of a problem by a definition, around this true pose if given; None if there is none.
 
-    Raises EvaluationError for a file under that name that is damaged, of other points or definition,
-    or around another true pose.
+    Raises EvaluationError for a file under that name that is damaged, of other points or another
+    definition, or around another true pose.
     """
     path = plausible_path(folder, problem, settings)
     if not path.exists():
