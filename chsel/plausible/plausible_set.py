@@ -356,16 +356,19 @@ def load_plausible(
 ) -> PlausibleSet | None:
     """The set of a problem by a definition, around this true pose if given; None if there is none.
 
-    Raises EvaluationError for a file under that name that is damaged, or around another true pose.
+    Raises EvaluationError for a file under that name that is damaged, of other points or another
+    definition, or around another true pose.
     """
     path = plausible_path(folder, problem, settings)
     if not path.exists():
         return None
     members = read_plausible(path)
-    if world_from_object is not None and not (members.truth == world_from_object).all():
+    name = _name(members.points_digest, members.settings, members.seed, members.sdf_digest)
+    moved = world_from_object is not None and not (members.truth == world_from_object).all()
+    if moved or name != path.name:
         raise EvaluationError(
-            f"plausible set {path} belongs to another true pose; accepted: this one, so remove the "
-            "file to have it computed again"
+            f"plausible set {path} belongs to other points or another true pose; accepted: these, "
+            "so remove the file to have it computed again"
         )
     return members
 
