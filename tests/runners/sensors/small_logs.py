@@ -9,19 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
-from foxglove_schemas_protobuf.Log_pb2 import Log
-from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
-from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
-from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
 from mcap_ros2.writer import Writer
 from PIL import Image
 
@@ -55,22 +43,6 @@ def write_ros2(
             writer.write_message(topic, schemas[kind], message, log_time)
         if finished:
             writer.finish()
-    return path.read_bytes()
-
-
-def write_foxglove(path: Path, sent: Sequence[tuple[str, Any, int]]) -> bytes:
-    """A log of Foxglove's messages; its bytes."""
-    with path.open("wb") as file:
-        writer = McapWriter(file, chunk_size=2000)
-        writer.start()
-        channels: dict[str, int] = {}
-        for topic, message, log_time in sent:
-            if topic not in channels:
-                name = message.DESCRIPTOR.full_name
-                schema = writer.register_schema(name, "protobuf", b"of no matter")
-                channels[topic] = writer.register_channel(topic, "protobuf", schema)
-            writer.add_message(channels[topic], log_time, message.SerializeToString(), log_time)
-        writer.finish()
     return path.read_bytes()
 
 
@@ -178,51 +150,3 @@ def ros2_sent(count: int = 4) -> list[Sent]:
         ]
         sent += [(*one, stamp + 10**6) for one in of_step]
     return sent
-
-
-def foxglove_sent() -> list[tuple[str, Any, int]]:
-    """A message of each kind of Foxglove's."""
-    x, y, z, w = QUARTER_TURN
-    time = {"seconds": BEGIN // SECOND, "nanos": 5}
-    pose = {
-        "position": {"x": 1.0, "y": 2.0, "z": 3.0},
-        "orientation": {"x": x, "y": y, "z": z, "w": w},
-    }
-    metres = np.array([[0.5, np.nan], [0.25, 2.0]], "<f4")
-    transform = FrameTransform(
-        timestamp=time,
-        parent_frame_id="world",
-        child_frame_id="base",
-        translation={"x": 1.0},
-        rotation={"x": 2 * x, "y": 2 * y, "z": 2 * z, "w": 2 * w},
-    )
-    fields = [
-        PackedElementField(name=name, offset=4 * index, type=PackedElementField.FLOAT32)
-        for index, name in enumerate("xyz")
-    ]
-    cloud = PointCloud(
-        timestamp=time,
-        frame_id="lidar",
-        pose=pose,
-        point_stride=12,
-        fields=fields,
-        data=np.array([[1.0, 0.0, 0.0]], "<f4").tobytes(),
-    )
-    info = CameraCalibration(timestamp=time, frame_id="camera", width=2, height=2)
-    info.K.extend([400.0, 0.0, 1.0, 0.0, 410.0, 0.5, 0.0, 0.0, 1.0])
-    image = RawImage(timestamp=time, frame_id="camera", width=2, height=2, encoding="32FC1")
-    image.step, image.data = 8, metres.tobytes()
-    packed = CompressedImage(timestamp=time, frame_id="camera", format="png", data=png(depth()))
-    sent = [
-        ("/tf", transform),
-        ("/transforms", FrameTransforms(transforms=[transform, transform])),
-        ("/depth", image),
-        ("/compressed", packed),
-        ("/info", info),
-        ("/pose", PoseInFrame(timestamp=time, frame_id="base", pose=pose)),
-        ("/poses", PosesInFrame(timestamp=time, frame_id="base", poses=[pose])),
-        ("/cloud", cloud),
-        ("/log", Log(timestamp=time, message="begin 1")),
-        ("/pair", KeyValuePair(key="begin", value="2")),
-    ]
-    return [(topic, message, BEGIN + index) for index, (topic, message) in enumerate(sent)]

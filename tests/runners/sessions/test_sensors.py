@@ -162,9 +162,6 @@ def test_images_come_ahead_of_their_probe(events: list[Any], log: Path) -> None:
     assert not any(isinstance(event, SensorImage) for event in without)
     for one, other in zip(probes(events), probes(without), strict=True):
         assert one.new_points.digest == other.new_points.digest
-
-
-def test_the_hand_is_shown_where_it_was(events: list[Any]) -> None:
     path = probes(events)[0].gripper_path
     assert 10 < len(path) <= 200
     np.testing.assert_allclose(path[0], hand_pose(0.0), atol=1e-9)
@@ -175,20 +172,16 @@ def test_the_hand_is_shown_where_it_was(events: list[Any]) -> None:
 def test_the_seed_chooses_among_contact_pixels_and_changes_nothing_else(
     events: list[Any], log: Path
 ) -> None:
-    again = probes(open_log(log).probes())[0]
+    session = open_log(log)  # which can be read twice
+    assert len(list(session.probes())) == len(events)
+    again = probes(session.probes())[0]
+    assert session.report.total()["pad"].contacts == 50
     other = probes(open_log(log, seed=1).probes())[0]
     first = probes(events)[0]
     assert again.new_points.digest == first.new_points.digest
     np.testing.assert_array_equal(other.new_points.free, first.new_points.free)
     assert len(other.contacts) == 50
     assert not np.array_equal(other.contacts, first.contacts)
-
-
-def test_a_session_can_be_read_twice(log: Path) -> None:
-    session = open_log(log)
-    one, other = ([p.new_points.digest for p in probes(session.probes())] for _ in range(2))
-    assert one == other
-    assert session.report.total()["pad"].contacts == 50
 
 
 def test_contacts_count_between_begin_and_end_alone(tmp_path: Path) -> None:
@@ -219,47 +212,20 @@ def test_annotations_leave_out_and_add_contacts(log: Path) -> None:
     annotations = Annotations(
         exclude=(0,),
         contacts=(
-            ExtraContacts(0, foremost=5),
-            ExtraContacts(1, points=((0.9, 0.01, 0.41), (0.9, 0.0, 0.41))),
+            ExtraContacts(1, points=((0.9, 0.01, 0.41), (9.0, 0.0, 0.4), (0.9, 0.0, 0.41))),
             ExtraContacts(7, points=((0.9, 0.01, 0.41),)),
         ),
     )
     events = list(open_log(log, replace(RIG, annotations=annotations)).probes())
     first, second = probes(events)
-    # The foremost part of a plane that gives way is at the membrane's rim.
-    assert first.contacts[0, 0] == pytest.approx(CENTRE[0] - RADIUS + 0.012, abs=0.001)
-    assert len(first.contacts) == 1
+    assert (first.outcome, len(first.contacts)) == ("free", 0)
     np.testing.assert_array_equal(second.contacts, [[0.9, 0.01, 0.41], [0.9, 0.0, 0.41]])
     assert (second.contact_normals == 0.0).all()
     assert "annotates probe 7, which the log does not have" in lines(events)
+    assert "probe 1: a contact left out, as it is out of the workspace" in lines(events)
     assert "probe 0: contacts left out" in lines(events, "info")
-
-
-def test_contacts_that_a_rig_adds_must_be_finite_and_within_the_workspace(log: Path) -> None:
-    with pytest.raises(SettingError, match=r"points\[1\]\[1\] is not finite"):
+    with pytest.raises(SettingError, match=r"points\[1\] is not finite"):
         ExtraContacts(0, points=((0.9, 0.0, 0.4), (0.9, float("nan"), 0.4)))
-    added = (ExtraContacts(1, points=((0.9, 0.0, 0.41), (9.0, 0.0, 0.4))),)
-    events = list(open_log(log, replace(RIG, annotations=Annotations((), added))).probes())
-    np.testing.assert_array_equal(probes(events)[1].contacts, [[0.9, 0.0, 0.41]])
-    assert "probe 1: a contact that the rig adds is left out, as it is out of" in lines(events)
-
-
-def test_the_references_ways_tell_less(log: Path, events: list[Any]) -> None:
-    assert RIG.hand is not None
-    scaled = replace(RIG.cameras[0], rays="scaled_images")
-    backwards = replace(RIG.hand, sweep="backwards")
-    rig = replace(RIG, cameras=(scaled,), hand=backwards)
-    found = probes(open_log(log, rig).probes())
-    both = [sum(len(p.new_points.free) for p in some) for some in (found, probes(events))]
-    assert 0.3 * both[1] < both[0] < both[1]
-    rig = replace(RIG, cameras=(), hand=backwards)
-    free = probes(open_log(log, rig).probes())[0].new_points.free
-    end = hand_pose(2.0)[:3, 3] + [HAND_FROM_PAD[2, 3] + MEMBRANE, 0.0, 0.0]
-    behind = end[0] - free[:, 0]
-    # 0.02 to 0.15 m behind the membrane, as deep as it was pressed in; one voxel is the grid's.
-    assert len(free) > 50
-    assert -0.5 * SPACING < behind.min() - 0.02 < SPACING
-    assert behind.max() < 0.15 + 0.012 + SPACING
 
 
 # The box of the rig, 2 cm aside of its place as long as the finger's joint is at 0.
@@ -306,7 +272,6 @@ def test_a_log_of_foxgloves_messages_gives_the_same_to_the_bit(
     other = in_foxgloves_messages(log, tmp_path / "foxglove.mcap", packed=packed)
     session = open_log(other)
     again = list(session.probes())
-    assert {topic.encoding for topic in session._log.topics.values()} == {"protobuf"}
     assert again[0].source != events[0].source
     again[0] = replace(again[0], source=events[0].source)
     assert len(again) == len(events)
@@ -407,7 +372,7 @@ def test_a_log_that_lacks_something_says_so(
         open_log(log, replace(RIG, **changes))
 
 
-def test_depths_in_another_unit_are_an_error_that_names_it(tmp_path: Path, log: Path) -> None:
+def test_no_depths_and_those_in_another_unit_are_errors(tmp_path: Path, log: Path) -> None:
     metres = SphereLog(unit=1.0).write(tmp_path / "log.mcap")  # so that whole metres are sent
     with pytest.raises(SessionError, match=r"/camera/depth of camera has depths of 0.001 m \(medi"):
         open_log(metres)
@@ -415,9 +380,6 @@ def test_depths_in_another_unit_are_an_error_that_names_it(tmp_path: Path, log: 
     millimetres = replace(RIG.bubbles[0], unit=0.001)
     with pytest.raises(SessionError, match=r"at 0.001 m a unit\); accepted: from 0.01 to 0.1 m"):
         open_log(log, replace(RIG, bubbles=(millimetres,)))
-
-
-def test_a_topic_of_another_kind_is_no_depth(log: Path) -> None:
     wrong = replace(RIG.cameras[0], depth="/probe")
     with pytest.raises(SessionError, match=r"/probe of camera gives no depth images \(its schem"):
         open_log(log, replace(RIG, cameras=(wrong,)))
