@@ -7,9 +7,9 @@ import pytest
 
 from chsel.numerics.arrays import FloatArray
 from chsel.sensing.depth_camera import PinholeCamera
+from runners.simulated_robot.cabinet import CAP, CAP_BASE
 from runners.simulated_robot.pads import TAUTNESS, Membrane
 from runners.simulated_robot.settings import BubbleSettings
-from runners.simulated_robot.wrist import CAP, CAP_BASE
 
 CAMERA = BubbleSettings().pinhole
 APEX = CAP_BASE + CAP[2]
