@@ -1,4 +1,4 @@
-"""Small logs as robots write them, with one message or more of all kinds that are read."""
+"""Small logs as robots write them, with messages of all kinds that are read, and their sessions."""
 
 from __future__ import annotations
 
@@ -13,15 +13,28 @@ from mcap.writer import CompressionType
 from mcap_ros2.writer import Writer
 from PIL import Image
 
+from chsel.problem.poses import compose
 from chsel.sensing.depth_camera import PinholeCamera
-from runners.sensors.log.ros2_definitions import full_definition
-from runners.simulated_robot.log_writer import camera_info, header, image, joint_state
+from replay.events import Logged, Probe
+from runners.sensors.log.ros2_definitions import DEFINITIONS, full_definition
+from runners.sensors.rig import Rig
+from runners.sessions.sensors import SensorsSession, SensorsSettings
+from runners.simulated_robot.log_writer import camera_info, header, image, joint_state, transform
 
 SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND
-QUARTER_TURN = (0.0, 0.0, 0.5**0.5, 0.5**0.5)  # about z
 
 Sent = tuple[str, str, Any, int]  # topic, type, message, log time
+
+
+def read(
+    path: Path, rig: Rig, diameter: float | None = None
+) -> tuple[SensorsSession, list[Probe], str]:
+    """The session of a log, its probes, and what was told."""
+    session = SensorsSession(SensorsSettings(rig, str(path)), 0, diameter=diameter)
+    events = list(session.probes())
+    told = "\n".join(event.text for event in events if isinstance(event, Logged))
+    return session, [event for event in events if isinstance(event, Probe)], told
 
 
 def write_ros2(
@@ -44,30 +57,6 @@ def write_ros2(
         if finished:
             writer.finish()
     return path.read_bytes()
-
-
-def ros2_image(values: np.ndarray, stamp: int, **changes: Any) -> dict[str, Any]:
-    """A sensor_msgs/Image, its rows with four bytes of padding."""
-    rows = np.ascontiguousarray(values).view(np.uint8).reshape(len(values), -1)
-    rows = np.pad(rows, ((0, 0), (0, 4)))
-    return (
-        image("camera", values, stamp) | {"step": rows.shape[1], "data": rows.tobytes()} | changes
-    )
-
-
-def ros2_transform(
-    parent: str,
-    child: str,
-    position: Sequence[float],
-    stamp: int,
-    quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
-) -> dict[str, Any]:
-    """A geometry_msgs/TransformStamped."""
-    transform = {
-        "translation": dict(zip("xyz", position, strict=True)),
-        "rotation": dict(zip("xyzw", quaternion, strict=True)),
-    }
-    return {"header": header(parent, stamp), "child_frame_id": child, "transform": transform}
 
 
 def ros2_cloud(points: np.ndarray, stamp: int) -> dict[str, Any]:
@@ -105,48 +94,46 @@ def depth(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(300, 900, (3, 5)).astype(np.uint16)
 
 
+def xyz(*numbers: float) -> dict[str, float]:
+    """A vector, or a quaternion."""
+    return dict(zip("xyzw", numbers, strict=False))
+
+
 def ros2_sent(count: int = 4) -> list[Sent]:
     """What a robot sends in a few seconds; log times are 1 ms after the stamps."""
     sent: list[Sent] = []
     for step in range(count):
         stamp = BEGIN + step * SECOND
         camera, base = {"header": header("camera", stamp)}, {"header": header("base", stamp)}
-        fixed = ros2_transform("base", "camera", (0.0, 0.0, 1.0), stamp)
-        moved = ros2_transform("world", "base", (step, 0.0, 0.0), stamp)
+        above, moved = (compose(np.eye(3), np.array(p)) for p in ([0, 0, 1.0], [step, 0, 0.0]))
         info = camera_info("camera", PinholeCamera(5, 3, 400.0, 410.0, 2.0, 1.0), stamp)
         packed = {**camera, "format": "png", "data": png(depth(step))}
         quantised = struct.pack("<iff", 1, 100.0, -20.0) + packed["data"]
         inverse = {**camera, "format": "32FC1; compressedDepth png", "data": quantised}
-        pose = {
-            "position": {"x": 1.0, "y": 2.0, "z": 3.0},
-            "orientation": dict(zip("xyzw", QUARTER_TURN, strict=True)),
-        }
-        wrench = {
-            "force": {"x": 1.0, "y": 2.0, "z": -3.0},
-            "torque": {"x": 0.25, "y": 0.0, "z": 0.5},
-        }
-        joints = joint_state(["elbow", "wrist"], [0.5, -0.25], stamp)
-        cloud = ros2_cloud(np.arange(6.0).reshape(2, 3), stamp)
+        pose = {"position": xyz(1.0, 2.0, 3.0), "orientation": xyz(0.0, 0.0, 0.5**0.5, 0.5**0.5)}
+        wrench = {"force": xyz(1.0, 2.0, -3.0), "torque": xyz(0.25, 0.0, 0.5)}
         of_step: list[tuple[str, str, Any]] = [
-            ("/tf_static", "tf2_msgs/TFMessage", {"transforms": [fixed]}),
-            ("/tf", "tf2_msgs/TFMessage", {"transforms": [moved]}),
-            ("/depth", "sensor_msgs/Image", ros2_image(depth(step), stamp)),
-            ("/compressed", "sensor_msgs/CompressedImage", packed),
-            ("/quantised", "sensor_msgs/CompressedImage", inverse),
-            ("/info", "sensor_msgs/CameraInfo", info),
-            ("/pose", "geometry_msgs/PoseStamped", {**base, "pose": pose}),
-            ("/poses", "geometry_msgs/PoseArray", {**base, "poses": [pose, pose]}),
-            ("/point", "geometry_msgs/PointStamped", {**base, "point": {"x": 1.0, "z": 2.0}}),
             (
-                "/wrench",
-                "geometry_msgs/WrenchStamped",
-                {"header": header("hand", stamp), "wrench": wrench},
+                "/tf_static",
+                "TFMessage",
+                {"transforms": [transform("base", "camera", above, stamp)]},
             ),
-            ("/joints", "sensor_msgs/JointState", joints),
-            ("/cloud", "sensor_msgs/PointCloud2", cloud),
-            ("/probe", "std_msgs/String", {"data": f"begin {step}"}),
-            ("/touch", "std_msgs/Bool", {"data": step % 2 == 0}),
-            ("/count", "std_msgs/Int32", {"data": -step}),
+            ("/tf", "TFMessage", {"transforms": [transform("world", "base", moved, stamp)]}),
+            ("/depth", "Image", image("camera", depth(step), stamp)),
+            ("/compressed", "CompressedImage", packed),
+            ("/quantised", "CompressedImage", inverse),
+            ("/info", "CameraInfo", info),
+            ("/pose", "PoseStamped", {**base, "pose": pose}),
+            ("/poses", "PoseArray", {**base, "poses": [pose, pose]}),
+            ("/point", "PointStamped", {**base, "point": {"x": 1.0, "z": 2.0}}),
+            ("/wrench", "WrenchStamped", {"header": header("hand", stamp), "wrench": wrench}),
+            ("/joints", "JointState", joint_state(["elbow", "wrist"], [0.5, -0.25], stamp)),
+            ("/cloud", "PointCloud2", ros2_cloud(np.arange(6.0).reshape(2, 3), stamp)),
+            ("/probe", "String", {"data": f"begin {step}"}),
+            ("/touch", "Bool", {"data": step % 2 == 0}),
+            ("/count", "Int32", {"data": -step}),
         ]
-        sent += [(*one, stamp + 10**6) for one in of_step]
+        for topic, kind, message in of_step:
+            (name,) = (name for name in DEFINITIONS if name.split("/")[1] == kind)
+            sent.append((topic, name, message, stamp + 10**6))
     return sent

@@ -54,14 +54,10 @@ def test_edges_are_where_the_camera_is_worst(bar: tuple[np.ndarray, np.ndarray])
     assert (measured[:, band] == 0).mean() > 0.2
     assert wrong[:, far_off].mean() == 0.0
     assert (measured[:, far_off] == 0).mean() < 0.01
-
-
-def test_edge_pixels_float_between_both_sides(bar: tuple[np.ndarray, np.ndarray]) -> None:
-    _, measured = bar
+    # Some pixels at edges float between both sides.
     between = (measured > 1000 * (NEAR + 0.05)) & (measured < 1000 * (FAR - 0.05))
-    columns = np.flatnonzero(between.any(axis=0))
     assert between.sum() > PINHOLE.height / 4
-    assert (np.minimum(np.abs(columns - LEFT), np.abs(columns - RIGHT)) < 12).all()
+    assert not between[:, (np.abs(columns - LEFT) >= 12) & (np.abs(columns - RIGHT) >= 12)].any()
 
 
 def test_the_shadow_of_the_second_eye_is_as_wide_as_geometry_says(

@@ -22,16 +22,16 @@ from runners.sensors.log.messages import (
 )
 from runners.sensors.log.raw_log import RawLog
 from runners.sensors.log.ros2_definitions import full_definition
-from runners.simulated_robot.log_writer import joint_state
+from runners.simulated_robot.log_writer import image, joint_state
 from tests.runners.sensors.foxglove_log import in_foxgloves_messages
 from tests.runners.sensors.small_logs import (
     BEGIN,
     SECOND,
     depth,
     png,
-    ros2_image,
     ros2_sent,
     write_ros2,
+    xyz,
 )
 
 TURNED = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])
@@ -109,14 +109,14 @@ def test_broken_messages_are_counted_with_their_topic(tmp_path: Path) -> None:
         {"data": b""},
         {"header": {"stamp": {"sec": -1, "nanosec": 0}, "frame_id": "a"}},
     ]
-    changed = [("/depth", "sensor_msgs/Image", ros2_image(depth(), 5, **c), 9) for c in images]
+    usual = image("camera", depth(), 5)
+    changed = [("/depth", "sensor_msgs/Image", {**usual, **change}, 9) for change in images]
     picture = {"header": {}, "format": "png", "data": png(depth())[:60]}
     changed.append(("/compressed", "sensor_msgs/CompressedImage", picture, 9))
-    zero = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0}
-    lost = {"position": {"x": np.nan}, "orientation": {"w": 1.0}}
-    for pose in ({"position": {}, "orientation": zero}, lost):
-        changed.append(("/pose", "geometry_msgs/PoseStamped", {"header": {}, "pose": pose}, 9))
-    wrench = {"header": {}, "wrench": {"force": {"x": np.nan}, "torque": {}}}
+    for place, turn in ((xyz(0.0, 0.0, 0.0), xyz(0.0, 0.0, 0.0, 0.0)), (xyz(np.nan), {"w": 1.0})):
+        pose = {"header": {}, "pose": {"position": place, "orientation": turn}}
+        changed.append(("/pose", "geometry_msgs/PoseStamped", pose, 9))
+    wrench = {"header": {}, "wrench": {"force": xyz(np.nan), "torque": {}}}
     changed.append(("/wrench", "geometry_msgs/WrenchStamped", wrench, 9))
     write_ros2(tmp_path / "log.mcap", [*good, *changed])
     log = RawLog(tmp_path / "log.mcap")

@@ -12,7 +12,8 @@ from mcap.writer import CompressionType
 from chsel.errors import SessionError
 from replay.files import file_digest
 from runners.sensors.log.raw_log import RawLog
-from tests.runners.sensors.small_logs import BEGIN, ros2_image, ros2_sent, write_ros2
+from runners.simulated_robot.log_writer import image
+from tests.runners.sensors.small_logs import BEGIN, ros2_sent, write_ros2
 
 
 def texts(path: Path) -> list[str]:
@@ -53,7 +54,7 @@ def test_messages_come_in_order_of_log_time(tmp_path: Path) -> None:
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 2**16, (64, 128)).astype(np.uint16)
     sent = [
-        ("/depth", "sensor_msgs/Image", ros2_image(noise, BEGIN + n), BEGIN + n) for n in range(500)
+        ("/depth", "sensor_msgs/Image", image("a", noise, BEGIN + n), BEGIN + n) for n in range(500)
     ]
     plain = CompressionType.NONE
     write_ros2(tmp_path / "log.mcap", sent, chunk_size=200_000, compression=plain)
