@@ -3,24 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.JointState_pb2 import JointState
-from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
-from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
-from foxglove_schemas_protobuf.Log_pb2 import Log
-from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
-from foxglove_schemas_protobuf.Point3InFrame_pb2 import Point3InFrame
-from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
-from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
@@ -45,7 +32,7 @@ def in_foxgloves_messages(source: Path, target: Path, *, packed: bool) -> Path:
         messages = make_reader(read, decoder_factories=[DecoderFactory()])
         for kind, channel, message, said in messages.iter_decoded_messages():
             assert kind is not None
-            for again in _said_again(kind.name, said, packed):
+            for again in _said_again(kind.name.split("/")[-1], said, packed):
                 if channel.topic not in channels:
                     name = again.DESCRIPTOR.full_name
                     schema = writer.register_schema(name, "protobuf", b"of no matter")
@@ -57,57 +44,62 @@ def in_foxgloves_messages(source: Path, target: Path, *, packed: bool) -> Path:
     return target
 
 
+def _made(kind: str, said: Any = None, **fields: Any) -> Any:
+    """A message of Foxglove's with the head of one of ROS 2."""
+    if said is not None:
+        stamp = said.header.stamp
+        fields |= {"timestamp": {"seconds": stamp.sec, "nanos": stamp.nanosec}}
+        fields |= {"frame_id": said.header.frame_id}
+    made = getattr(import_module(f"foxglove_schemas_protobuf.{kind}_pb2"), kind)
+    known = made.DESCRIPTOR.fields_by_name
+    return made(**{name: value for name, value in fields.items() if name in known})
+
+
 def _said_again(kind: str, said: Any, packed: bool) -> Iterator[Any]:
-    match kind.split("/")[-1]:
+    match kind:
         case "TFMessage":
             moved = [_transform(one) for one in said.transforms]
-            yield from moved if packed else [FrameTransforms(transforms=moved)]
+            yield from moved if packed else [_made("FrameTransforms", transforms=moved)]
         case "Image" if packed and said.encoding == "16UC1":
             values = np.frombuffer(said.data, "<u2").reshape(said.height, -1)[:, : said.width]
-            yield CompressedImage(format="png", data=png(values), **_head(said))
+            yield _made("CompressedImage", said, format="png", data=png(values))
         case "Image":
             size = {"width": said.width, "height": said.height, "step": said.step}
-            yield RawImage(encoding=said.encoding, data=bytes(said.data), **size, **_head(said))
+            yield _made("RawImage", said, encoding=said.encoding, data=bytes(said.data), **size)
         case "CameraInfo":
             size = {"width": said.width, "height": said.height}
-            yield CameraCalibration(K=list(said.k), D=list(said.d), **size, **_head(said))
+            yield _made("CameraCalibration", said, K=list(said.k), D=list(said.d), **size)
         case "JointState":
             pairs = zip(said.name, said.position, strict=True)
-            joints = [JointState(name=name, position=value) for name, value in pairs]
-            yield JointStates(timestamp=_head(said)["timestamp"], joints=joints)
+            joints = [_made("JointState", name=name, position=value) for name, value in pairs]
+            yield _made("JointStates", said, joints=joints)
         case "String" if packed:
             key, _, value = said.data.partition(" ")
-            yield KeyValuePair(key=key, value=value)
+            yield _made("KeyValuePair", key=key, value=value)
         case "String":
-            yield Log(message=said.data)
+            yield _made("Log", message=said.data)
         case "CompressedImage" if said.format == "png":
-            yield CompressedImage(format="png", data=bytes(said.data), **_head(said))
+            yield _made("CompressedImage", said, format="png", data=bytes(said.data))
         case "PoseStamped":
-            yield PoseInFrame(pose=_pose(said.pose), **_head(said))
+            yield _made("PoseInFrame", said, pose=_pose(said.pose))
         case "PoseArray":
-            yield PosesInFrame(poses=[_pose(one) for one in said.poses], **_head(said))
+            yield _made("PosesInFrame", said, poses=[_pose(one) for one in said.poses])
         case "PointStamped":
-            yield Point3InFrame(point=_xyz(said.point), **_head(said))
+            yield _made("Point3InFrame", said, point=_xyz(said.point))
         case "PointCloud2":
+            places = {field.name: (field.offset, field.datatype) for field in said.fields}
             points = packed_points(
                 said.data,
-                {field.name: (field.offset, field.datatype) for field in said.fields},
+                places,
                 said.point_step,
                 size=(said.width, said.height),
                 row=said.row_step,
                 big_endian=said.is_bigendian,
             )
-            fields = [
-                PackedElementField(name=name, offset=8 * k, type=PackedElementField.FLOAT64)
-                for k, name in enumerate("xyz")
-            ]
-            yield PointCloud(
-                pose={"position": {"x": 1.0}, "orientation": {"w": 2.0}},
-                point_stride=24,
-                fields=fields,
-                data=(points - [1.0, 0.0, 0.0]).tobytes(),
-                **_head(said),
-            )
+            fields = [{"name": name, "offset": 8 * k, "type": 8} for k, name in enumerate("xyz")]
+            pose = {"position": {"x": 1.0}, "orientation": {"w": 2.0}}
+            data = (points - [1.0, 0.0, 0.0]).tobytes()
+            yield _made("PointCloud", said, pose=pose, point_stride=24, fields=fields, data=data)
 
 
 def _xyz(one: Any) -> dict[str, float]:
@@ -118,19 +110,12 @@ def _pose(one: Any) -> dict[str, Any]:
     return {"position": _xyz(one.position), "orientation": _xyz(one.orientation)}
 
 
-def _transform(one: Any) -> FrameTransform:
-    return FrameTransform(
-        timestamp=_head(one)["timestamp"],
+def _transform(one: Any) -> Any:
+    return _made(
+        "FrameTransform",
+        one,
         parent_frame_id=one.header.frame_id,
         child_frame_id=one.child_frame_id,
         translation=_xyz(one.transform.translation),
         rotation=_xyz(one.transform.rotation),
     )
-
-
-def _head(said: Any) -> dict[str, Any]:
-    stamp = said.header.stamp
-    return {
-        "timestamp": {"seconds": stamp.sec, "nanos": stamp.nanosec},
-        "frame_id": said.header.frame_id,
-    }

@@ -101,30 +101,21 @@ class SphereLog:
                 transform("world", "lidar", compose(np.eye(3), LIDAR), stamp),
             ]
             self._add(writer, "/tf_static", "tf2_msgs/TFMessage", {"transforms": fixed}, stamp)
+        images = []
         if tick % 2 == 0:
-            self._image(writer, "pad", INNER, membrane(hand).astype(np.float32), stamp, stamp)
+            images.append(("pad", INNER, membrane(hand).astype(np.float32), stamp))
         if tick % 10 == 0:
             ahead = stamp + round(self.camera_clock * SECOND)
-            numbers = np.rint(seen() / self.unit).astype(np.uint16)
-            self._image(writer, "camera", OUTER, numbers, ahead, stamp)
+            images.append(("camera", OUTER, np.rint(seen() / self.unit).astype(np.uint16), ahead))
+        for name, camera, values, seen_at in images:
+            info = camera_info(f"{name}_frame", camera, seen_at)
+            self._add(writer, f"/{name}/info", "sensor_msgs/CameraInfo", info, stamp)
+            depth = image(f"{name}_frame", values, seen_at)
+            self._add(writer, f"/{name}/depth", "sensor_msgs/Image", depth, stamp)
         if self.cloud and tick in (10, 40):
             cloud = ros2_cloud(np.array(self.cloud), stamp)
             for topic in ("/lidar", "/skin"):
                 self._add(writer, topic, "sensor_msgs/PointCloud2", cloud, stamp)
-
-    def _image(
-        self,
-        writer: LogWriter,
-        name: str,
-        camera: PinholeCamera,
-        values: np.ndarray,
-        stamp: int,
-        sent: int,
-    ) -> None:
-        info = camera_info(f"{name}_frame", camera, stamp)
-        self._add(writer, f"/{name}/info", "sensor_msgs/CameraInfo", info, sent)
-        depth = image(f"{name}_frame", values, stamp)
-        self._add(writer, f"/{name}/depth", "sensor_msgs/Image", depth, sent)
 
     def _add(
         self, writer: LogWriter, topic: str, kind: str, message: dict[str, Any], sent: int

@@ -23,7 +23,7 @@ from tests.runners.sensors.small_logs import BEGIN, read, ros2_cloud, write_ros2
 from tests.runners.sensors.sphere_log import CENTRE, MEMBRANE, RADIUS, RIG, SphereLog, heights
 from tests.runners.sensors.test_depth_frame import scene, written
 
-PLAIN_MEMBRANE, PLAIN_SEEN = sphere_log.membrane, sphere_log.seen
+PLAIN_MEMBRANE = sphere_log.membrane
 WITHOUT = GateRig(jump=1e6, part=0.0, speckle=0)
 
 
@@ -74,26 +74,6 @@ def test_small_patches_of_contact_beside_a_large_one_are_left_out(
     assert session.report.total()["pad"].small > 0
     every = replace(sensitive, gate=WITHOUT)
     assert np.abs(heights(read(log, every)[1][0].contacts)).max() > 0.006
-
-
-def test_few_pixels_behind_the_object_give_no_rays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def spoilt() -> FloatArray:
-        depth = PLAIN_SEEN()
-        row, column = np.argwhere(depth == depth.min())[0]  # of the sphere, whose half this is
-        depth[row - 2 : row + 3, column - 2 : column + 3] += 0.045
-        return depth
-
-    monkeypatch.setattr(sphere_log, "seen", spoilt)
-    log = SphereLog().write(tmp_path / "log.mcap")
-    rig = replace(RIG, cameras=(replace(RIG.cameras[0], edge=0.2),), hand=None, bubbles=())
-    session, found, _ = read(log, rig)
-    count = session.report.total()["camera"]
-    assert count.small >= 25 * count.used
-    assert heights(np.concatenate([probe.new_points.free for probe in found])).min() > -0.01
-    plain = read(log, replace(rig, gate=WITHOUT))[1]
-    assert heights(np.concatenate([probe.new_points.free for probe in plain])).min() < -0.02
 
 
 def cloud_rig(role: str) -> Rig:

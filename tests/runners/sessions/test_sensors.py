@@ -8,18 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
 from chsel.errors import SessionError, SettingError
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import apply, inverse
-from chsel.problem.sdf_grid import mesh_sdf
+from chsel.problem.poses import apply
 from chsel.problem.settings import build_settings, settings_mapping
 from replay.events import Logged, Probe, RigDescribed, SensorImage
-from runners.command.choices import CONF
-from runners.objects.loader import ObjectConfig, load_object
 from runners.sensors.pose_file import beside, write_pose
 from runners.sensors.rig import Annotations, CloudRig, ExtraContacts, HandRig, ProbeTimes, Rig
 from runners.sessions import session_settings
@@ -367,29 +363,3 @@ def test_rigs_are_plain_settings_in_which_misspelled_keys_are_errors(log: Path) 
         session_settings("sensors", values)
     with pytest.raises(SettingError, match=r"path is missing; pass session.path=LOG"):
         build_settings(SensorsSettings, {"rig": settings_mapping(RIG)}, "session")
-
-
-def test_the_simulated_cell_is_read_like_any_other(tmp_path: Path) -> None:
-    pytest.importorskip("pybullet")
-    from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
-    from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
-    from runners.simulated_robot.simulation import simulate_log
-
-    mesh = load_object(ObjectConfig("mustard", 1.0, 0.0003, "mustard"), tmp_path).mesh
-    small = RobotSettings(1, CameraSettings(width=96), BubbleSettings(width=64))
-    log = tmp_path / "log.mcap"
-    made = simulate_log(log, CABINET_CONFIGURATIONS["cabinet_mustard"], mesh, 0, small)
-    rig = OmegaConf.to_container(OmegaConf.load(CONF / "session" / "rig" / "cabinet.yaml"))
-    rig["cameras"][0]["edge_reach"] = 2  # of fewer pixels than usual
-    session = SensorsSession(session_settings("sensors", {"path": str(log), "rig": rig}), 0)
-    (probe,) = probes(session.probes())
-    object_from_world = inverse(made.world_from_object)
-    distance = np.abs(mesh_sdf(mesh, apply(object_from_world, probe.contacts))[0])
-    assert len(distance) >= 30
-    assert distance.mean() < 0.001
-    assert distance.max() < 0.003
-    free = mesh_sdf(mesh, apply(object_from_world, probe.new_points.free))[0]
-    assert len(free) > 5000
-    assert free.min() > -0.02  # a coarse image with strays at edges
-    assert (free < 0.0).mean() < 0.01
-    assert sum(counts.lost for counts in session.report.total().values()) == 0

@@ -103,12 +103,8 @@ def test_messages_of_both_encodings_are_decoded(tmp_path: Path, foxglove: str) -
 
 def test_broken_messages_are_counted_with_their_topic(tmp_path: Path) -> None:
     good = ros2_sent(1)
-    images = [
-        {"encoding": "rgb8"},
-        {"height": 2**31},
-        {"data": b""},
-        {"header": {"stamp": {"sec": -1, "nanosec": 0}, "frame_id": "a"}},
-    ]
+    ages_ago = {"stamp": {"sec": -1, "nanosec": 0}, "frame_id": "a"}
+    images = [{"encoding": "rgb8"}, {"height": 2**31}, {"header": ages_ago}]
     usual = image("camera", depth(), 5)
     changed = [("/depth", "sensor_msgs/Image", {**usual, **change}, 9) for change in images]
     picture = {"header": {}, "format": "png", "data": png(depth())[:60]}
@@ -124,8 +120,8 @@ def test_broken_messages_are_counted_with_their_topic(tmp_path: Path) -> None:
     counts = Counter(fault.partition(":")[0] for fault in log.faults.elements())
     assert counts == {"/depth": len(images), "/compressed": 1, "/pose": 2, "/wrench": 1}
     said = " ".join(log.faults)
-    for reason in ("'rgb8' is no depth", "quaternion is 0", "position is not", "force or torque"):
-        assert reason in said
+    assert "'rgb8' is no depth" in said
+    assert "a force or torque is not finite" in said
 
 
 def test_unknown_schemas_and_fields_are_faults(tmp_path: Path) -> None:

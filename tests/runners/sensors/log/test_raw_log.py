@@ -49,6 +49,8 @@ def test_messages_come_in_order_of_log_time(tmp_path: Path) -> None:
     assert [received.content for received in given] == [f"begin {step}" for step in range(6)]
     assert told[-1] == (log.size, log.size)
     assert len(texts(tmp_path / "log.mcap")) == len(sent)
+    with pytest.raises(SessionError, match=r"no topic /a; it has .*/depth \(sensor_msgs/msg/Ima"):
+        log.messages(["/a"])
 
 
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
@@ -86,12 +88,6 @@ def test_what_is_no_log_is_an_error(
         (tmp_path / name).write_bytes(content)
     with pytest.raises(SessionError, match=message):
         RawLog(tmp_path / name)
-
-
-def test_a_topic_that_is_not_there_is_an_error_that_lists_the_others(tmp_path: Path) -> None:
-    write_ros2(tmp_path / "log.mcap", ros2_sent(1))
-    with pytest.raises(SessionError, match=r"no topic /a; it has .*/depth \(sensor_msgs/msg/Ima"):
-        RawLog(tmp_path / "log.mcap").messages(["/a"])
 
 
 def flip(data: bytearray) -> None:
