@@ -60,24 +60,16 @@ def write_ros2(
 
 
 def ros2_cloud(points: np.ndarray, stamp: int) -> dict[str, Any]:
-    """A sensor_msgs/PointCloud2 of one row: z first, y as float64, then four bytes of nothing."""
-    kind = np.dtype({"names": list("zxy"), "formats": [">f4", ">f4", ">f8"], "itemsize": 20})
-    packed = np.zeros(len(points), kind)
-    for axis, name in enumerate("xyz"):
-        packed[name] = points[:, axis]
-    fields = [
-        {"name": name, "offset": kind.fields[name][1], "datatype": 8 if name == "y" else 7}
-        for name in "zxy"
-    ]
+    """A sensor_msgs/PointCloud2 of one row of points (N, 3), as float64."""
+    fields = [{"name": n, "offset": 8 * k, "datatype": 8, "count": 1} for k, n in enumerate("xyz")]
     return {
         "header": header("lidar", stamp),
         "height": 1,
         "width": len(points),
-        "fields": [{**field, "count": 1} for field in fields],
-        "is_bigendian": True,
-        "point_step": 20,
-        "row_step": 20 * len(points),
-        "data": packed.tobytes(),
+        "fields": fields,
+        "point_step": 24,
+        "row_step": 24 * len(points),
+        "data": points.astype("<f8").tobytes(),
         "is_dense": True,
     }
 

@@ -18,6 +18,7 @@ from chsel.problem.mesh import load_mesh
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
+from runners.command.choices import CONF
 from runners.objects.loader import ObjectModel
 from runners.sensors.depth_frame import (
     DepthFrame,
@@ -29,7 +30,6 @@ from runners.sensors.depth_frame import (
 from runners.sensors.rig import GateRig, Rig
 from runners.sessions.sensors import DepthFrameSession
 
-REPOSITORY = Path(__file__).resolve().parents[3]
 WIDTH, HEIGHT = 80, 60
 INTRINSICS = {"fx": 100.0, "fy": 110.0, "cx": 39.5, "cy": 29.5}
 BOX = (slice(20, 40), slice(30, 60))  # pixels of a box that faces the camera
@@ -38,8 +38,8 @@ POSE = [[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0,
 
 
 def rig(**camera: Any) -> Rig:
-    path = REPOSITORY / "conf" / "session" / "rig" / "depth_frame.yaml"
-    built = build_settings(Rig, yaml.safe_load(path.read_text()), "session.rig")
+    values = yaml.safe_load((CONF / "session" / "rig" / "depth_frame.yaml").read_text())
+    built = build_settings(Rig, values, "session.rig")
     (only,) = built.cameras
     return dataclasses.replace(built, cameras=(dataclasses.replace(only, **camera),))
 
@@ -59,15 +59,9 @@ def written(folder: Path, **changes: Any) -> Path:
     depth, label = scene()
     Image.fromarray(depth).save(folder / "depth.png")
     Image.fromarray(label).save(folder / "label.png")
-    values = {
-        "depth": "depth.png",
-        "depth_scale": 0.001,
-        "intrinsics": INTRINSICS,
-        "label": "label.png",
-        "object_class": 7,
-        "factor_depth_in_file": 1000,
-    }
-    values = {key: value for key, value in {**values, **changes}.items() if value is not None}
+    values = {"depth": "depth.png", "depth_scale": 0.001, "intrinsics": INTRINSICS}
+    values |= {"label": "label.png", "object_class": 7, "factor_depth_in_file": 1000, **changes}
+    values = {key: value for key, value in values.items() if value is not None}
     path = folder / "frame.yaml"
     path.write_text(json.dumps(values))
     return path

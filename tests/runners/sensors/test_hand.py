@@ -22,7 +22,6 @@ GRIPPER = """<?xml version="1.0"?>
   </link>
   <joint name="slide" type="prismatic">
     <parent link="palm"/><child link="left"/><axis xyz="0 2 0"/><origin xyz="0 0 0.1"/>
-    <limit lower="0" upper="0.1" effort="1" velocity="1"/>
   </joint>
   <link name="left">
     <collision><geometry><cylinder radius="0.01" length="0.06"/></geometry></collision>

@@ -14,11 +14,9 @@ from scipy.spatial import cKDTree
 from chsel.errors import SessionError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
-from chsel.problem.settings import build_settings, settings_mapping
 from replay.events import Logged, Probe, RigDescribed, SensorImage
 from runners.sensors.pose_file import beside, write_pose
 from runners.sensors.rig import Annotations, CloudRig, ExtraContacts, HandRig, ProbeTimes, Rig
-from runners.sessions import session_settings
 from runners.sessions.sensors import SensorsSession, SensorsSettings
 from tests.replay.conftest import same_bits
 from tests.runners.sensors.foxglove_log import in_foxgloves_messages
@@ -194,17 +192,10 @@ def test_annotations_leave_out_and_add_contacts(log: Path) -> None:
 
 
 # The box of the rig, 2 cm aside of its place as long as the finger's joint is at 0.
-HAND_URDF = """<robot name="hand">
-  <link name="flange"/>
-  <link name="pad">
-    <collision><geometry><box size="0.04 0.06 0.08"/></geometry></collision>
-  </link>
-  <joint name="finger" type="prismatic">
-    <parent link="flange"/><child link="pad"/>
-    <origin xyz="0 -0.02 0.04"/><axis xyz="0 1 0"/>
-    <limit lower="-1" upper="1" effort="1" velocity="1"/>
-  </joint>
-</robot>"""
+HAND_URDF = """<robot name="hand"><link name="flange"/>
+  <link name="pad"><collision><geometry><box size="0.04 0.06 0.08"/></geometry></collision></link>
+  <joint name="finger" type="prismatic"><parent link="flange"/><child link="pad"/>
+    <origin xyz="0 -0.02 0.04"/><axis xyz="0 1 0"/></joint></robot>"""
 
 
 def test_a_hand_of_a_urdf_sweeps_what_its_boxes_sweep(tmp_path: Path) -> None:
@@ -342,6 +333,8 @@ def test_a_pose_beside_the_log_is_the_true_one(tmp_path: Path) -> None:
     assert open_log(log, pose="none").world_from_object is None
     with pytest.raises(SessionError, match=r"other.yaml: cannot be read"):
         open_log(log, pose=str(tmp_path / "other.yaml"))
+    with pytest.raises(SettingError, match=r"path is missing; pass session.path=LOG"):
+        SensorsSettings(RIG)
 
 
 def test_the_reference_of_a_pad_can_be_a_file(log: Path, tmp_path: Path) -> None:
@@ -353,13 +346,3 @@ def test_the_reference_of_a_pad_can_be_a_file(log: Path, tmp_path: Path) -> None
     pad = replace(RIG.bubbles[0], reference=str(tmp_path / "whole.npy"))
     found = probes(open_log(log, replace(RIG, bubbles=(pad,))).probes())
     assert np.abs(heights(found[0].contacts)).max() < 0.0015
-
-
-def test_rigs_are_plain_settings_in_which_misspelled_keys_are_errors(log: Path) -> None:
-    values = {"path": str(log), "rig": settings_mapping(RIG)}
-    assert session_settings("sensors", values).rig == RIG
-    values["rig"]["cameras"][0]["edges"] = 0.1
-    with pytest.raises(SettingError, match=r"rig.cameras\[0\].edges does not exist; did you mean"):
-        session_settings("sensors", values)
-    with pytest.raises(SettingError, match=r"path is missing; pass session.path=LOG"):
-        build_settings(SensorsSettings, {"rig": settings_mapping(RIG)}, "session")

@@ -56,17 +56,21 @@ def test_compressed_depth_is_that_of_image_transport() -> None:
     np.testing.assert_allclose(found, depth, rtol=5e-3)
 
 
-def test_points_of_several_rows_with_gaps() -> None:
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_points_of_several_rows_with_gaps(order: str) -> None:
     points = np.random.default_rng(1).normal(size=(2, 3, 3))
+    points[..., 1] = points[..., 1].astype(np.float32)
+    kinds = [order + kind for kind in ("f8", "f4", "f8")]
     layout = np.dtype(
-        {"names": list("xyz"), "formats": ["<f8"] * 3, "offsets": [8, 16, 0], "itemsize": 30}
+        {"names": list("xyz"), "formats": kinds, "offsets": [8, 16, 0], "itemsize": 30}
     )
     packed = np.zeros((2, 3), layout)
     for axis, name in enumerate("xyz"):
         packed[name] = points[:, :, axis]
     rows = np.pad(packed.view(np.uint8).reshape(2, 90), ((0, 0), (0, 40)))
-    fields = {"x": (8, 8), "intensity": (24, 4), "y": (16, 8), "z": (0, 8)}
-    found = packed_points(rows.tobytes(), fields, 30, size=(3, 2), row=130)
+    fields = {"x": (8, 8), "intensity": (24, 4), "y": (16, 7), "z": (0, 8)}
+    big = order == ">"
+    found = packed_points(rows.tobytes(), fields, 30, size=(3, 2), row=130, big_endian=big)
     np.testing.assert_array_equal(found, points.reshape(-1, 3))
     for size in ((5, 2), (3, 3)):
         with pytest.raises(UnusableMessage, match="cannot have 260 bytes"):
