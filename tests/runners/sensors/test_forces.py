@@ -46,21 +46,20 @@ def hand_pose(seconds: float) -> FloatArray:
     return compose(forward, np.array([0.3 + 0.1 * travel, 0.0, 0.1]))
 
 
-def wrench(seconds: float, settled: float) -> FloatArray:
-    """Force and torque (6,) in the sensor's frame; the hand is in contact for 0.1 s.
-
-    settled: seconds before which the sensor measures twice the hand's weight.
-    """
-    force, moment = np.zeros(3), np.zeros(3)
-    if abs(seconds - 2.0) < 0.055 or abs(seconds - 1.5) < 1e-6:  # and a spike
-        sensor_from_hand = inverse(HAND_FROM_SENSOR)
-        force = sensor_from_hand[:3, :3] @ FORCE
-        moment = np.cross(apply(sensor_from_hand, TIP[None])[0], force)
-    return np.concatenate([force, moment]) + WEIGHT * (2.0 if seconds < settled else 1.0)
+def wrench(seconds: float) -> FloatArray:
+    """Force and torque (6,) of a contact in the sensor's frame; it lasts for 0.1 s."""
+    if abs(seconds - 2.0) >= 0.055 and abs(seconds - 1.5) > 1e-6:  # a spike
+        return np.zeros(6)
+    sensor_from_hand = inverse(HAND_FROM_SENSOR)
+    force = sensor_from_hand[:3, :3] @ FORCE
+    return np.concatenate([force, np.cross(apply(sensor_from_hand, TIP[None])[0], force)])
 
 
 def write_log(path: Path, *, torque: bool = True, settled: float = 0.0, lacks: str = "") -> Path:
-    """Four seconds at 100 Hz; lacks: a topic without messages."""
+    """Four seconds at 100 Hz; lacks: a topic without messages.
+
+    settled: seconds before which the sensor measures twice the hand's weight.
+    """
     fixed = {"transforms": [transform("hand", "ft", HAND_FROM_SENSOR, BEGIN)]}
     sent = [("/tf_static", "tf2_msgs/TFMessage", fixed, BEGIN)]
     for tick in range(401):
@@ -68,7 +67,7 @@ def write_log(path: Path, *, torque: bool = True, settled: float = 0.0, lacks: s
         stamp = BEGIN + round(seconds * SECOND)
         moving = {"transforms": [transform("world", "hand", hand_pose(seconds), stamp)]}
         sent.append(("/tf", "tf2_msgs/TFMessage", moving, stamp))
-        numbers = wrench(seconds, settled)
+        numbers = wrench(seconds) + WEIGHT * (2.0 if seconds < settled else 1.0)
         felt = {"force": xyz(*numbers[:3]), "torque": xyz(*(torque * numbers[3:]))}
         message = {"header": header("ft", stamp), "wrench": felt}
         sent.append(("/wrench", "geometry_msgs/WrenchStamped", message, stamp))

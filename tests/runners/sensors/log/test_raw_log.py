@@ -2,7 +2,6 @@
 
 import hashlib
 import tracemalloc
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -90,30 +89,6 @@ def test_what_is_no_log_is_an_error(
         RawLog(tmp_path / name)
 
 
-def flip(data: bytearray) -> None:
-    """A bit of a chunk, or of a message that is not compressed."""
-    name = next(n for n in (b"zstd", b"lz4", b"begin 5") if n in data)
-    data[data.index(name, len(data) // 3) + (6 if name == b"begin 5" else 30)] ^= 1
-
-
-@pytest.mark.parametrize("compression", list(CompressionType))
-def test_damage_costs_the_messages_of_one_chunk_alone(
-    tmp_path: Path, compression: CompressionType
-) -> None:
-    path = tmp_path / "log.mcap"
-    data = bytearray(write_ros2(path, ros2_sent(8), chunk_size=1500, compression=compression))
-    whole = Counter(texts(path))
-    flip(data)
-    path.write_bytes(data)
-    log = RawLog(path)
-    left = Counter(repr(one) for one in log.messages(log.topics))
-    assert left < whole
-    assert left.total() > 0.5 * whole.total()
-    total = log.faults.total()
-    assert list(log.messages(log.topics))
-    assert log.faults.total() == total  # reading again does not count it again
-
-
 def test_a_cut_file_gives_what_is_before_the_cut(tmp_path: Path) -> None:
     data = write_ros2(tmp_path / "log.mcap", ros2_sent(8), chunk_size=1500)
     whole = texts(tmp_path / "log.mcap")
@@ -123,7 +98,10 @@ def test_a_cut_file_gives_what_is_before_the_cut(tmp_path: Path) -> None:
     assert 0 < len(left) < len(whole)
     assert left == whole[: len(left)]
     assert any("without its index" in text for text in log.warnings)
-    assert log.faults
+    total = log.faults.total()
+    assert total > 0
+    assert list(log.messages(log.topics))
+    assert log.faults.total() == total  # reading again does not count it again
 
 
 @pytest.mark.parametrize("by_topic", [False, True])
