@@ -174,7 +174,7 @@ class HandPath:
         """times (T,): of all transforms, nanoseconds, ascending."""
         self._frame, self._model, self._joints, self._times = rig.frame, model, joints, times
         self._cell = cell
-        self._filled: dict[bytes, FloatArray] = {}  # points in a part, by its vertices
+        self._filled: dict[bytes, FloatArray] = {}  # points in each part, by its vertices
 
     def follow(self, window: ProbeWindow, counts: Counts) -> FloatArray:
         """Sweep the hand along the path of a probe; some of its poses (P, 4, 4), in their order."""
@@ -210,12 +210,12 @@ class HandPath:
 
     def _interior(self, joints: dict[str, float]) -> FloatArray:
         """Points (M, 3) in the hand, dense enough to miss no voxel."""
-        nodes = [np.zeros((0, 3))]
+        before, self._filled = self._filled, {}
         side = 0.5 * self._cell.spacing
         for part in self._model.parts(joints):
             place = np.asarray(part.vertices).tobytes()
-            if place not in self._filled:
-                self._filled[place] = interior_lattice(part, side)
-            nodes.append(self._filled[place])
+            known = before.get(place)
+            self._filled[place] = interior_lattice(part, side) if known is None else known
+        nodes = np.concatenate([np.zeros((0, 3)), *self._filled.values()])
         lattice = Lattice((0.0, 0.0, 0.0), side)
-        return lattice.centres(np.unique(lattice.voxels(np.concatenate(nodes)), axis=0))
+        return lattice.centres(np.unique(lattice.voxels(nodes), axis=0))

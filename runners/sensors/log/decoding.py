@@ -213,16 +213,12 @@ def _wrench(message: Any, frame: str) -> WrenchMessage:
     return WrenchMessage(frame, force, torque)
 
 
-def _ros2_joints(message: Any, _: str) -> Joints:
-    return _joints(zip(message.name, message.position, strict=True))
-
-
-def _foxglove_joints(message: Any, _: str) -> Joints:
-    known = [joint for joint in message.joints if joint.HasField("position")]
-    return _joints((joint.name, joint.position) for joint in known)
-
-
-def _joints(positions: Iterable[tuple[str, float]]) -> Joints:
+def _joints(message: Any, _: str) -> Joints:
+    if hasattr(message, "joints"):  # of Foxglove
+        known = [joint for joint in message.joints if joint.HasField("position")]
+        positions = [(joint.name, joint.position) for joint in known]
+    else:
+        positions = list(zip(message.name, message.position, strict=True))
     found = {one_line(name): float(position) for name, position in positions}
     for name, position in found.items():
         if not math.isfinite(position):
@@ -311,7 +307,7 @@ _ROS2: dict[str, Read] = {
     "sensor_msgs/CompressedImage": _compressed_image,
     "sensor_msgs/CameraInfo": _ros2_camera,
     "sensor_msgs/PointCloud2": _ros2_cloud,
-    "sensor_msgs/JointState": _ros2_joints,
+    "sensor_msgs/JointState": _joints,
     "tf2_msgs/TFMessage": _transform,
     "geometry_msgs/TransformStamped": _transform,
     "geometry_msgs/PoseStamped": _pose,
@@ -334,7 +330,7 @@ _FOXGLOVE: dict[str, Read] = {
     "foxglove.PosesInFrame": _poses,
     "foxglove.Point3InFrame": _point,
     "foxglove.PointCloud": _foxglove_cloud,
-    "foxglove.JointStates": _foxglove_joints,
+    "foxglove.JointStates": _joints,
     "foxglove.Log": _log,
     "foxglove.KeyValuePair": _pair,
 }
