@@ -7,27 +7,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
-from rich.filesize import decimal
 
 from chsel.errors import SettingError, require_choice
 from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
 from replay.console import Console
-from replay.files import WritingError, whole_file
 from runners.command.program import command, plain
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.scans import AssetsConfig
-from runners.run.display import counting_bar
-from runners.sessions.configurations import Configuration
+from runners.sensors.pose_file import write_pose
 from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
 from runners.simulated_robot.settings import RobotSettings
-from runners.simulated_robot.simulation import Push, SimulatedLog, probe_count, simulate_log
+from runners.simulated_robot.simulation import Push, simulate_log
 
 ConfigStore.instance().store("robot", settings_mapping(RobotSettings()), package="_global_")
 EPSILON = 0.001  # m: that of an object which no configuration file describes; unused here
+_STOPS = {"pads": "felt by the pads", "hand": "stopped by the hand", "end": "nothing touched"}
 
 
 @dataclass(frozen=True)
@@ -55,72 +52,30 @@ def main(config: DictConfig) -> None:
     own = {name: values.pop(name) for name in SimulateRigConfig.__dataclass_fields__}
     checked = build_settings(SimulateRigConfig, own, "simulate_rig")
     settings = build_settings(RobotSettings, values, "simulate_rig")
-    configuration = CABINET_CONFIGURATIONS[checked.configuration]
-    count = probe_count(configuration, settings)
-    chosen = _object(checked.object, configuration)
+    name, seed = checked.configuration, checked.seed
+    configuration = CABINET_CONFIGURATIONS[name]
+    chosen = checked.object
+    if "kind" not in chosen:  # our own model of the configuration's object
+        chosen = {"name": configuration.object, "epsilon": EPSILON, **chosen, "configuration": name}
+    model = load_object(build_settings(ObjectConfig, chosen, "object"), checked.assets.folder)
     log = Path(checked.out or "").expanduser()
     truth = log.with_suffix(".truth.yaml")
     for path in (log, truth):
         if os.path.lexists(path) and not checked.overwrite:
             raise SettingError(f"{path} exists; accepted: another out=FILE.mcap, or overwrite=true")
-    mesh = load_object(chosen, checked.assets.folder).mesh
     console = Console()
-    console.print(
-        f"{chosen.name} at scale {chosen.scale:g} in {configuration.name}, probes 0 to "
-        f"{count - 1}, seed {checked.seed}",
-        style="bold",
-    )
-    try:
-        with counting_bar(console) as bar:
-            task = bar.add_task("probes", total=count)
+    console.print(f"{model.name} at scale {model.scale:g} in {name}, seed {seed}", style="bold")
 
-            def on_push(push: Push) -> None:
-                bar.advance(task)
-                bar.console.print(_line(push))
+    def on_push(push: Push) -> None:
+        place = f"y {push.y:+.3f} z {push.z:.3f} m  pushed {push.reach:.3f} m"
+        console.print(f"probe {push.step:>3}  {place}  {_STOPS[push.stopped]}")
 
-            simulated = simulate_log(log, configuration, mesh, checked.seed, settings, on_push)
-        with whole_file(truth) as beside:
-            beside.write_text(_truth(checked, chosen, simulated))
-    except WritingError as error:
-        reason = error.__cause__ or error
-        raise SettingError(
-            f"{log} cannot be written ({getattr(reason, 'strerror', None) or reason}); accepted: "
-            "an out=FILE.mcap that can be written"
-        ) from error
-    written = f"{decimal(log.stat().st_size)}, {simulated.messages} messages of"
+    made = simulate_log(log, configuration, model.mesh, seed, settings, on_push)
+    about = {"configuration": name, "object": model.name, "scale": model.scale, "seed": seed}
+    write_pose(truth, made.world_from_object, about, overwrite=True)
     console.print(str(log), soft_wrap=True)
-    console.print(f"  {written} {simulated.seconds:.1f} simulated seconds")
     console.print(str(truth), soft_wrap=True)
     console.print("  the true pose")
-
-
-def _object(values: dict[str, Any], configuration: Configuration) -> ObjectConfig:
-    """The chosen object; without a choice, our own model of the configuration's."""
-    if "kind" not in values:
-        values = {"name": configuration.object, "epsilon": EPSILON, **values}
-        values["configuration"] = configuration.name
-    return build_settings(ObjectConfig, values, "object")
-
-
-def _line(push: Push) -> str:
-    stops = {"pads": "felt by the pads", "hand": "stopped by the hand", "end": "nothing touched"}
-    pads = ", ".join(f"{pad} {pixels} px" for pad, pixels in push.pressed.items() if pixels)
-    return (
-        f"probe {push.step:>3}  y {push.y:+.3f} z {push.z:.3f} m  pushed "
-        f"{push.reach:.3f} m  {stops[push.stopped]}{f' ({pads})' if pads else ''}"
-    )
-
-
-def _truth(config: SimulateRigConfig, chosen: ObjectConfig, simulated: SimulatedLog) -> str:
-    content = {
-        "configuration": config.configuration,
-        "object": chosen.name,
-        "kind": chosen.kind,
-        "scale": chosen.scale,
-        "seed": config.seed,
-        "world_from_object": simulated.world_from_object.tolist(),
-    }
-    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import sqrt
 
@@ -15,9 +13,7 @@ from chsel.problem.points import Workspace
 from chsel.sensing.free_space import FreeGrid
 from runners.sensors.log.transforms import TransformError, TransformTree
 from runners.sensors.rig import GateRig
-from runners.sensors.session_report import Counts, LogWarnings
-
-_NONE = np.zeros((0, 3))
+from runners.sensors.session_report import LogWarnings
 
 
 class FreeMap:
@@ -26,40 +22,23 @@ class FreeMap:
     def __init__(self, workspace: Workspace, spacing: float) -> None:
         self.workspace = workspace
         self.grid = FreeGrid(workspace, spacing)
-        self._reported = np.zeros(self.grid.shape, dtype=bool)
 
-    @contextmanager
-    def by(self, counts: Counts) -> Iterator[FreeGrid]:
-        """The grid to mark in; what becomes free within is counted as the counts'."""
-        before = self.grid.count
-        yield self.grid
-        counts.free += self.grid.count - before
-
-    def new(self, contacts: FloatArray = _NONE, normals: FloatArray = _NONE) -> FloatArray:
+    def new(self, contacts: FloatArray | None = None) -> FloatArray:
         """Centres (N, 3) of the voxels that became free since the last call.
 
-        Left out are those less than a voxel's diagonal from contacts (C, 3) with a rigid hand, and
-        behind them by the object's outward normals (C, 3): the hand passed such a voxel, but not
-        its centre.
+        Left out are those less than a voxel's diagonal from contacts (C, 6) with a rigid hand,
+        points and the object's outward normals, and behind them: the hand passed such a voxel, but
+        not its centre.
         """
         centres = self.grid.new()
-        if len(contacts) and len(centres):
-            reach = sqrt(3.0) * self.grid.lattice.spacing
-            away, nearest = cKDTree(contacts).query(centres, distance_upper_bound=reach)
-            near = np.flatnonzero(away <= reach)
-            beside = nearest[near]
-            ahead = ((centres[near] - contacts[beside]) * normals[beside]).sum(axis=1)
-            centres = np.delete(centres, near[ahead < 0.0], axis=0)
-        self._reported[tuple(self.grid.lattice.voxels(centres).T)] = True
-        return centres
-
-    def holds(self, points: FloatArray) -> BoolArray:
-        """Which of points (N, 3) lie in voxels that `new` has given."""
-        voxels = self.grid.lattice.voxels(points)
-        inside = ((voxels >= 0) & (voxels < self.grid.shape)).all(axis=1)
-        held = np.zeros(len(points), dtype=bool)
-        held[inside] = self._reported[tuple(voxels[inside].T)]
-        return held
+        if contacts is None or len(contacts) == 0 or len(centres) == 0:
+            return centres
+        reach = sqrt(3.0) * self.grid.lattice.spacing
+        away, nearest = cKDTree(contacts[:, :3]).query(centres, distance_upper_bound=reach)
+        near = np.flatnonzero(away <= reach)
+        beside = contacts[nearest[near]]
+        ahead = ((centres[near] - beside[:, :3]) * beside[:, 3:]).sum(axis=1)
+        return np.delete(centres, near[ahead < 0.0], axis=0)
 
     def within(self, points: FloatArray) -> BoolArray:
         """Which of points (N, 3) lie in the workspace, or less than a voxel beside it."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
-from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Lattice
 from chsel.problem.poses import apply
 from chsel.sensing.depth_camera import main_regions, point_regions
@@ -18,6 +20,8 @@ FARTHEST = 100.0  # m: no robot that probes an object measures rays of this leng
 
 class Clouds:
     """The points of one topic."""
+
+    reads: ClassVar[type] = CloudMessage
 
     def __init__(self, rig: CloudRig, cell: RobotCell, resolution: float) -> None:
         """resolution: metres; of surface points one a voxel of this side is kept."""
@@ -46,40 +50,33 @@ class Clouds:
         counts.pixels += len(message.points)
         counts.invalid += len(message.points) - len(points)
         counts.used += 1
-        points, origin = apply(pose, points), pose[:3, 3]
-        within_reach = self._within_reach(points, origin)
-        counts.outside += int((~within_reach).sum())
+        points, origin, free = apply(pose, points), pose[:3, 3], self._cell.free
         if self._place is None and len(points):
             self._place = np.median(points, axis=0)
-        points = points[within_reach]
         if self._rig.role == "rays":
-            with self._cell.free.by(counts) as grid:
-                grid.along_rays(origin, origin + self._rig.fraction * (points - origin))
+            reached = ((points - origin) ** 2).sum(axis=1) <= FARTHEST**2
+            ends = origin + self._rig.fraction * (points[reached] - origin)
+            counts.free += free.grid.along_rays(origin, ends)
         else:
-            self._new.append(self._unseen(points, counts))
+            reached = free.within(points)
+            self._new.append(self._unseen(points[reached], counts))
+        counts.outside += int((~reached).sum())
 
-    def check(self, total: Counts) -> str | None:
-        """What is suspicious about the counts of a whole log: that no point was within reach."""
-        if self._place is None or total.outside < total.pixels - total.invalid:
-            return None
-        place = ", ".join(f"{value:.4g}" for value in self._place)
-        reach = f"over {FARTHEST:g} m away" if self._rig.role == "rays" else "out of the workspace"
-        return (
-            f"{self._rig.topic}: all {total.outside} points are {reach}, in the first message "
-            f"around [{place}] m in the world; check its unit and frame, and the workspace"
-        )
+    def check(self, total: Counts) -> None:
+        """Warn if no point of a whole log was within reach."""
+        if self._place is not None and total.outside == total.pixels - total.invalid:
+            place = ", ".join(f"{value:.4g}" for value in self._place)
+            rays = self._rig.role == "rays"
+            reach = f"over {FARTHEST:g} m away" if rays else "out of the workspace"
+            self._cell.warnings.warn(
+                f"{self._rig.topic}: all {total.outside} points are {reach}, in the first message "
+                f"around [{place}] m in the world; check its unit and frame, and the workspace"
+            )
 
     def surface(self) -> FloatArray:
         """Points (N, 3) on the surface that came since the last call."""
         new, self._new = self._new, []
         return np.concatenate([np.zeros((0, 3)), *new])
-
-    def _within_reach(self, points: FloatArray, origin: FloatArray) -> BoolArray:
-        """Which of points (N, 3) can be used, or end a ray from origin (3,)."""
-        if self._rig.role != "rays":
-            return self._cell.free.within(points)
-        within: BoolArray = ((points - origin) ** 2).sum(axis=1) <= FARTHEST**2
-        return within
 
     def _unseen(self, points: FloatArray, counts: Counts) -> FloatArray:
         """The first point of every voxel that had none, of those that are the object's."""

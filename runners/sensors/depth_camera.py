@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,11 +19,12 @@ from chsel.sensing.free_space import FreeGrid
 from replay.events import SensorImage
 from runners.sensors.cell import RobotCell
 from runners.sensors.log.messages import ImageMessage
-from runners.sensors.rig import BubbleRig, CameraRig, GateRig
+from runners.sensors.rig import CameraRig, GateRig, ImageRig
 from runners.sensors.session_report import Counts
 
 INTEGER_UNIT = 0.001  # m: of 16-bit depth images, as all the world has it
 FINE, COARSE = 0.0001, 0.001  # m: units of recorded images
+_EARLY = 0.95  # of the interval between two images: stamps are not exact
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,13 +33,14 @@ class View:
 
     metres: FloatArray
     valid: BoolArray
+    camera: PinholeCamera
     world_from_camera: FloatArray
 
 
 def view_of(
     message: ImageMessage,
     time: int,
-    rig: CameraRig | BubbleRig,
+    rig: ImageRig,
     camera: PinholeCamera,
     cell: RobotCell,
     counts: Counts,
@@ -45,10 +48,8 @@ def view_of(
     """An image at a time, nanoseconds, and its pose; None, counted, where it cannot be used."""
     shape = (camera.height, camera.width)
     if message.values.shape != shape:
-        height, width = message.values.shape
         cell.warnings.warn(
-            f"{rig.name}: left out, as the image has {width} x {height} pixels and its "
-            f"camera {shape[1]} x {shape[0]}"
+            f"{rig.name}: left out, as the image has another size than its camera info says"
         )
         counts.unusable += 1
         return None
@@ -60,7 +61,7 @@ def view_of(
     valid = valid_pixels(depth, nearest=rig.range[0], furthest=rig.range[1])
     counts.pixels += valid.size
     counts.invalid += int(valid.size - valid.sum())
-    return View(depth, valid, world_from_camera)
+    return View(depth, valid, camera, world_from_camera)
 
 
 def metres(values: np.ndarray, unit: float | None) -> FloatArray:
@@ -70,64 +71,49 @@ def metres(values: np.ndarray, unit: float | None) -> FloatArray:
     return values.astype(np.float64) * unit
 
 
-def recorded_image(
-    step: int,
-    sensor: str,
-    kind: str,
-    image: FloatArray,
-    known: BoolArray,
-    mask: BoolArray,
-    camera: PinholeCamera,
-    world_from_camera: FloatArray,
-) -> SensorImage:
-    """An image (H, W) of metres, 0 where it is not known (H, W), as recordings have it."""
-    kept = np.where(known, image, 0.0)
+def recorded_image(step: int, sensor: str, kind: str, view: View, mask: BoolArray) -> SensorImage:
+    """An image with a mask (H, W) as recordings have it, 0 where it is not valid."""
+    kept, camera = np.where(view.valid, view.metres, 0.0), view.camera
     unit = FINE if kept.max(initial=0.0) < 65535 * FINE else COARSE
     values = np.clip(np.rint(kept / unit), 0, 65535).astype(np.uint16)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    return SensorImage(step, sensor, kind, values, unit, mask, intrinsics, world_from_camera)
+    return SensorImage(step, sensor, kind, values, unit, mask, intrinsics, view.world_from_camera)
 
 
-_EARLY = 0.95  # of the interval between two images: stamps are not exact
-
-
-def edge_pixels(rig: CameraRig, depth: FloatArray, valid: BoolArray) -> BoolArray:
-    """Valid pixels (H, W) beside a jump of depth (H, W), metres; none, if the rig asks for all."""
+def edge_pixels(rig: CameraRig, view: View) -> BoolArray:
+    """Valid pixels (H, W) beside a jump of depth; none, if the rig asks for all."""
     if rig.edge is None:
-        return np.zeros_like(valid)
-    return occlusion_edges(depth, valid, rig.edge, reach=rig.edge_reach)
+        return np.zeros_like(view.valid)
+    return occlusion_edges(view.metres, view.valid, rig.edge, reach=rig.edge_reach)
 
 
 def mark_rays(
-    grid: FreeGrid,
-    rig: CameraRig,
-    gate: GateRig,
-    camera: PinholeCamera,
-    view: View,
-    usable: BoolArray,
-) -> int:
-    """Mark what the rays of usable pixels (H, W) pass; how many end before their own depth.
+    grid: FreeGrid, rig: CameraRig, gate: GateRig, view: View, usable: BoolArray
+) -> tuple[int, int]:
+    """Mark what the rays of usable pixels (H, W) pass.
 
-    The rays of speckles end at the least depth of the valid pixels around them.
+    The rays of speckles end at the least depth of the valid pixels around them. Returns how many
+    voxels became free, and how many pixels are of speckles.
     """
-    regions = depth_regions(view.metres, usable, camera, gate.jump)
+    regions = depth_regions(view.metres, usable, view.camera, gate.jump)
     ends, small = speckle_free(view.metres, view.valid, regions, gate.speckle)
-    grid.from_depth(ends, camera, view.world_from_camera, usable, fraction=rig.fraction)
-    return small
+    pose = view.world_from_camera
+    return grid.from_depth(ends, view.camera, pose, usable, fraction=rig.fraction), small
 
 
 class DepthCamera:
     """Marks what it sees through (CHSEL, Sec. V-B: rays to 95 % of the depth)."""
 
+    reads: ClassVar[type] = ImageMessage
+
     def __init__(self, rig: CameraRig, camera: PinholeCamera, cell: RobotCell) -> None:
         self._rig, self._camera, self._cell = rig, camera, cell
-        several = rig.views > 1
-        workspace = cell.free.workspace
+        several, workspace = rig.views > 1, cell.free.workspace
         self._own = FreeGrid(workspace, cell.spacing, views=rig.views) if several else None
         self._last_time: int | None = None
         self._last: tuple[View, BoolArray] | None = None
 
-    def take(self, time: int, message: ImageMessage, counts: Counts) -> None:
+    def take(self, time: int, message: ImageMessage, counts: Counts, *, within: bool) -> None:
         """Use an image of the current probe, unless it comes too soon after the last one."""
         counts.images += 1
         if self._too_soon(time):
@@ -136,14 +122,17 @@ class DepthCamera:
         view = view_of(message, time, self._rig, self._camera, self._cell, counts)
         if view is None:
             return
-        edges = edge_pixels(self._rig, view.metres, view.valid)
+        edges = edge_pixels(self._rig, view)
         counts.edges += int(edges.sum())
         usable = view.valid & ~edges
         if not usable.any():
             counts.unusable += 1
             self._cell.warnings.warn(f"{self._rig.name}: an image without a pixel that counts")
             return
-        self._mark(view, usable, counts)
+        grid = self._cell.free.grid
+        fresh, small = mark_rays(self._own or grid, self._rig, self._cell.gate, view, usable)
+        counts.free += fresh if self._own is None else grid.at(self._own.new())
+        counts.small += small
         counts.used += 1
         self._last_time, self._last = time, (view, usable)
 
@@ -152,19 +141,9 @@ class DepthCamera:
         if self._last is None:
             return None
         (view, usable), self._last = self._last, None
-        name, pose = self._rig.name, view.world_from_camera
-        return recorded_image(
-            step, name, "depth", view.metres, view.valid, usable, self._camera, pose
-        )
+        return recorded_image(step, self._rig.name, "depth", view, usable)
 
     def _too_soon(self, time: int) -> bool:
         if self._rig.rate is None or self._last_time is None:
             return False
         return 0 <= time - self._last_time < _EARLY * 1e9 / self._rig.rate
-
-    def _mark(self, view: View, usable: BoolArray, counts: Counts) -> None:
-        with self._cell.free.by(counts) as grid:
-            target, gate = grid if self._own is None else self._own, self._cell.gate
-            counts.small += mark_rays(target, self._rig, gate, self._camera, view, usable)
-            if self._own is not None:
-                grid.at(self._own.new())

@@ -20,10 +20,9 @@ from chsel.sensing.depth_camera import PinholeCamera, depth_regions, main_region
 from chsel.sensing.free_space import FreeGrid
 from runners.sensors.depth_camera import View, edge_pixels, mark_rays, metres
 from runners.sensors.log.images import read_image
-from runners.sensors.pose_file import pose_of_rows
+from runners.sensors.pose_file import pose_of_rows, read_yaml
 from runners.sensors.rig import Rig
 from runners.sensors.session_report import Counts
-from runners.sensors.yaml_file import read_yaml
 
 SUFFIXES = (".yaml", ".yml")
 LABEL_MARGIN = 2  # pixels: by so much a label's outline may be off the depth image's
@@ -91,31 +90,22 @@ def read_depth_frame(path: str | Path) -> DepthFrame:
 
 
 def _frame(file: FrameFile, folder: Path) -> DepthFrame:
-    depth = _depth(file, _beside(folder, file.depth))
+    depth = _depth(file, folder)
     height, width = depth.shape
-    poses = {
-        name: pose_of_rows(name, rows)
-        for name in ("world_from_camera", "world_from_object")
-        if (rows := getattr(file, name)) is not None
-    }
+    camera, truth = file.world_from_camera, file.world_from_object
     return DepthFrame(
-        camera=PinholeCamera(width=width, height=height, **asdict(file.intrinsics)),
-        depth=depth,
-        world_from_camera=poses.get("world_from_camera", np.eye(4)),
-        label=None
-        if file.label is None
-        else _label(file, _beside(folder, file.label), depth.shape),
-        world_from_object=poses.get("world_from_object"),
-        mesh=None if file.object is None else _beside(folder, file.object),
+        PinholeCamera(width=width, height=height, **asdict(file.intrinsics)),
+        depth,
+        np.eye(4) if camera is None else pose_of_rows("world_from_camera", camera),
+        None if file.label is None else _label(file, folder, depth.shape),
+        None if truth is None else pose_of_rows("world_from_object", truth),
+        None if file.object is None else folder / Path(file.object).expanduser(),
     )
 
 
-def _beside(folder: Path, name: str) -> Path:
-    return folder / Path(name).expanduser()
-
-
-def _depth(file: FrameFile, path: Path) -> FloatArray:
+def _depth(file: FrameFile, folder: Path) -> FloatArray:
     """Metres (H, W)."""
+    path = folder / Path(file.depth).expanduser()
     stored = read_image(path, "depth")
     if stored.dtype == np.uint8:
         raise SessionError(f"depth {path}: 8 bits a pixel; accepted: 16, or floating point")
@@ -126,15 +116,15 @@ def _depth(file: FrameFile, path: Path) -> FloatArray:
     return depth
 
 
-def _label(file: FrameFile, path: Path, shape: tuple[int, ...]) -> BoolArray:
+def _label(file: FrameFile, folder: Path, shape: tuple[int, ...]) -> BoolArray:
     """The object's pixels (H, W)."""
+    path = folder / Path(file.label or "").expanduser()
     classes = read_image(path, "label")
-    if classes.dtype.kind not in "ui":
-        raise SessionError(f"label {path}: floating point; accepted: whole numbers")
-    if classes.shape != shape:
+    if classes.dtype.kind not in "ui" or classes.shape != shape:
         (height, width), (rows, columns) = shape, classes.shape
         raise SessionError(
-            f"label {path}: {columns} x {rows} pixels; accepted: those of depth, {width} x {height}"
+            f"label {path}: {columns} x {rows} pixels of {classes.dtype}; accepted: whole numbers, "
+            f"as many as of depth, {width} x {height}"
         )
     mask = classes != 0 if file.object_class is None else classes == file.object_class
     if not mask.any():
@@ -175,22 +165,22 @@ def depth_frame_points(
             f"no pixel of depth lies in the range of camera {camera.name}, {nearest:g} m to "
             f"{furthest:g} m; its median is {typical:.4g} m: check depth_scale"
         )
-    edges = edge_pixels(camera, frame.depth, valid)
+    view = View(frame.depth, valid, frame.camera, frame.world_from_camera)
+    edges = edge_pixels(camera, view)
     measured = frame.camera.back_project(frame.depth)
     counts = Counts(images=1, used=1, pixels=valid.size, invalid=int((~valid).sum()))
     counts.edges = int(edges.sum())
     rays = valid & ~edges
     surface, labelled = np.zeros_like(valid), None
     if frame.label is not None:
-        surface, labelled = _surface_pixels(frame, rig, valid, edges, measured, diameter)
+        surface, labelled = _surface_pixels(frame.label, view, edges, rig, measured, diameter)
         rays &= surface | ~frame.label
-        counts.outline, counts.far = labelled.outline, labelled.far
+        counts.outline, counts.far, counts.small = labelled.outline, labelled.far, labelled.small
     on_object = apply(frame.world_from_camera, measured[surface])
     workspace = _workspace(rig, on_object, diameter)
     grid = FreeGrid(workspace, free_resolution)  # there is one view, whatever the rig asks
-    view = View(frame.depth, valid, frame.world_from_camera)
-    counts.small = mark_rays(grid, camera, rig.gate, frame.camera, view, rays)
-    counts.small += 0 if labelled is None else labelled.small
+    _, small = mark_rays(grid, camera, rig.gate, view, rays)
+    counts.small += small
     points = KnownPoints(
         free=_outside_of(on_object, grid.new(), free_resolution),
         known=one_per_voxel(on_object, rig.surface_resolution),
@@ -210,10 +200,10 @@ def one_per_voxel(points: FloatArray, side: float) -> FloatArray:
 
 
 def _surface_pixels(
-    frame: DepthFrame,
-    rig: Rig,
-    valid: BoolArray,
+    label: BoolArray,
+    view: View,
     edges: BoolArray,
+    rig: Rig,
     measured: FloatArray,
     diameter: float | None,
 ) -> tuple[BoolArray, Counts]:
@@ -221,8 +211,7 @@ def _surface_pixels(
 
     Of these, those in regions that can be the object's; the others are counted by reason.
     """
-    label, square = frame.label, np.ones((3, 3), dtype=bool)
-    assert label is not None
+    square, valid = np.ones((3, 3), dtype=bool), view.valid
     within = binary_erosion(label, square, iterations=LABEL_MARGIN, border_value=1)
     surface = within & valid & ~edges
     if not surface.any():
@@ -230,7 +219,7 @@ def _surface_pixels(
             f"none of the {int(label.sum())} pixels of label is of the surface: outlines "
             "and edges of depth are left out, and pixels out of range"
         )
-    regions = depth_regions(frame.depth, surface, frame.camera, rig.gate.jump)
+    regions = depth_regions(view.metres, surface, view.camera, rig.gate.jump)
     found = main_regions(
         regions[surface], part=rig.gate.part, points=measured[surface], diameter=diameter
     )

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
-from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Lattice
 from chsel.problem.poses import apply, inverse, rotated
 from chsel.sensing.contact_sensing import contact_ahead, contact_on_axis
 from runners.sensors.cell import RobotCell
-from runners.sensors.contacts import Contacts
 from runners.sensors.hand import HandModel
 from runners.sensors.log.messages import WrenchMessage
 from runners.sensors.log.transforms import JointHistory
-from runners.sensors.rig import ForceRig, HandRig
+from runners.sensors.rig import ForceRig
 from runners.sensors.session_report import Counts
 
 _MOST_LOOKED_AT = 50  # samples of a probe, the strongest
@@ -38,18 +37,24 @@ class _Sample:
 class Forces:
     """The forces of one topic; of each probe, where the strongest act."""
 
+    reads: ClassVar[type] = WrenchMessage
+
     def __init__(
         self,
         rig: ForceRig,
-        hand: tuple[HandRig, HandModel, JointHistory],
+        frame: str,
+        model: HandModel,
+        joints: JointHistory,
         cell: RobotCell,
         resolution: float,
     ) -> None:
-        """resolution: metres; of the contacts of a probe one a voxel of this side is kept."""
+        """frame, model, joints: of the hand.
+
+        resolution: metres; of the contacts of a probe one a voxel of this side is kept.
+        """
         self._rig, self._cell = rig, cell
-        self._hand, self._model, self._joints = hand
+        self._frame, self._model, self._joints = frame, model, joints
         self._lattice = Lattice(cell.free.workspace.lower, resolution)
-        self._shape: tuple[dict[str, float], FloatArray] | None = None
         self._idle: deque[tuple[int, FloatArray]] = deque(maxlen=_MOST_TARED)
         self._tare: FloatArray | None = None
         self._within = self._has_torque = self._in_contact = False
@@ -81,21 +86,20 @@ class Forces:
             )
             self._set_tare(time)
 
-    def contacts(self, counts: Counts) -> Contacts:
-        """The contacts since the last call, the strongest first."""
+    def contacts(self, counts: Counts) -> FloatArray:
+        """The contacts (C, 6) since the last call, the strongest first: points and normals."""
         self._end_row(counts)
         samples, self._felt = sorted(self._felt, reverse=True)[:_MOST_LOOKED_AT], []
-        found: dict[tuple[int, ...], tuple[FloatArray, FloatArray]] = {}
+        found: dict[tuple[int, ...], FloatArray] = {}
         for sample in samples:
             contact = self._contact(sample, counts)
             if contact is not None:
-                voxel = tuple(self._lattice.voxels(contact[0][None])[0].tolist())
+                voxel = tuple(self._lattice.voxels(contact[None, :3])[0].tolist())
                 found.setdefault(voxel, contact)
             if len(found) == self._rig.points:
                 break
         counts.contacts += len(found)
-        points, normals = [point for point, _ in found.values()], [n for _, n in found.values()]
-        return Contacts(np.reshape(points, (-1, 3)), np.reshape(normals, (-1, 3)))
+        return np.reshape(list(found.values()), (-1, 6))
 
     def _set_tare(self, time: int) -> None:
         """The median of what came last; without any, the tare stays what it was."""
@@ -111,11 +115,10 @@ class Forces:
             self._end_row(counts)
             return
         self._row.append(sample)
-        if not self._in_contact and len(self._row) < self._rig.samples:
-            return
-        self._in_contact = True
-        self._felt += self._row
-        self._row.clear()
+        if self._in_contact or len(self._row) >= self._rig.samples:
+            self._in_contact = True
+            self._felt += self._row
+            self._row.clear()
 
     def _end_row(self, counts: Counts) -> None:
         """The force is no longer above the threshold, or its probe is over."""
@@ -123,17 +126,19 @@ class Forces:
         self._row.clear()
         self._in_contact = False
 
-    def _contact(self, sample: _Sample, counts: Counts) -> tuple[FloatArray, FloatArray] | None:
-        """Where a force acts, and the object's outward normal there (3,), world; None, counted."""
+    def _contact(self, sample: _Sample, counts: Counts) -> FloatArray | None:
+        """Where a force acts, and the object's outward normal (6,), world; None, counted."""
         sensor = self._rig.frame or sample.frame
         world_from_sensor = self._cell.world_from(sensor, sample.time, self._rig.topic)
-        world_from_hand = self._cell.world_from(self._hand.frame, sample.time, self._rig.topic)
+        world_from_hand = self._cell.world_from(self._frame, sample.time, self._rig.topic)
         if world_from_sensor is None or world_from_hand is None:
             counts.lost += 1
             return None
-        triangles = self._triangles(sample.time)
+        solids = self._model.solids(self._joints.during(sample.time, sample.time + 1)[0][1])
+        assert solids is not None  # a rig with forces has some
+        corners = np.asarray(solids.triangles, dtype=np.float64).reshape(-1, 3)
         sensor_from_hand = inverse(world_from_sensor) @ world_from_hand
-        triangles = apply(sensor_from_hand, triangles.reshape(-1, 3)).reshape(-1, 3, 3)
+        triangles = apply(sensor_from_hand, corners).reshape(-1, 3, 3)
         force, torque = np.array(sample.numbers[:3]), np.array(sample.numbers[3:])
         if self._rig.torque and self._has_torque:
             found = contact_on_axis(force, torque, triangles)
@@ -143,17 +148,5 @@ class Forces:
         if found.miss > self._rig.reach or not self._cell.free.within(point)[0]:
             counts.outside += 1
             return None
-        return point[0], -rotated(world_from_sensor[:3, :3], found.normal[None])[0]
-
-    def _triangles(self, time: int) -> FloatArray:
-        """Of the hand's solids as they were (F, 3, 3), in its frame, metres."""
-        joints = self._joints.during(time, time + 1)[0][1]
-        if self._shape is None or self._shape[0] != joints:
-            solids = self._model.solids(joints)
-            if solids is None:
-                raise SettingError(
-                    f"{self._rig.topic}: no link of hand.urdf is solid; accepted: hand.boxes, or a "
-                    "URDF with collision shapes"
-                )
-            self._shape = joints, np.asarray(solids.triangles, dtype=np.float64)
-        return self._shape[1]
+        normal = -rotated(world_from_sensor[:3, :3], found.normal[None])
+        return np.concatenate([point[0], normal[0]])

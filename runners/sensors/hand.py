@@ -1,25 +1,32 @@
-"""The solid parts of the hand: boxes of the rig, and the links of a URDF."""
+"""The hand: its solid parts, boxes of the rig and links of a URDF, and what they sweep."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Mapping
-from pathlib import Path, PurePosixPath
+from collections.abc import Iterator, Mapping
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from chsel.errors import SettingError
+from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.problem.points import Lattice
 from chsel.problem.poses import compose, roll_pitch_yaw
+from chsel.sensing.free_space import interior_lattice, poses_between
+from runners.sensors.cell import RobotCell
+from runners.sensors.log.probe_windows import ProbeWindow
+from runners.sensors.log.transforms import JointHistory
 from runners.sensors.rig import BoxRig, HandRig
+from runners.sensors.session_report import Counts
 
 if TYPE_CHECKING:
     import trimesh
 
+MOST_POSES = 200  # of a probe's path, as it is shown
+_BATCH = 50_000  # poses looked up at once
 _MOVING = ("revolute", "continuous", "prismatic")
-_TYPES = (*_MOVING, "fixed", "floating", "planar")
-_CYLINDER_SIDES = 32  # the prism lies within the cylinder, so it claims no free space too much
 
 
 class HandModel:
@@ -30,10 +37,12 @@ class HandModel:
     """
 
     def __init__(self, rig: HandRig) -> None:
-        self._boxes = [_box(box) for box in rig.boxes]
-        self._linkage = None if rig.urdf is None else _Linkage(Path(rig.urdf), rig.root)
-        self.joint_names = () if self._linkage is None else self._linkage.joint_names
-        self.warnings = () if self._linkage is None else self._linkage.warnings
+        self.joint_names: tuple[str, ...] = ()
+        self.warnings: list[str] = []
+        self._boxes = [box_mesh(box) for box in rig.boxes]
+        self._links: list[tuple[str, trimesh.Trimesh]] = []  # nodes of the scene, with their solids
+        if rig.urdf is not None:
+            self._read_urdf(Path(rig.urdf), rig.root)
 
     def parts(self, joints: Mapping[str, float] | None = None) -> list[trimesh.Trimesh]:
         """Closed solids in the hand's frame, metres; they may overlap.
@@ -41,8 +50,15 @@ class HandModel:
         joints: values by name, radians or metres. Those of other joints do not matter, missing
         ones are 0.
         """
-        links = [] if self._linkage is None else self._linkage.solids(joints or {})
-        return self._boxes + links
+        if not self._links:
+            return list(self._boxes)
+        values = {name: (joints or {}).get(name, 0.0) for name in self.joint_names}
+        self._robot.update_cfg(values)
+        graph = self._robot.collision_scene.graph
+        return self._boxes + [
+            solid.copy().apply_transform(graph.get(node, frame_from=self._root)[0])
+            for node, solid in self._links
+        ]
 
     def solids(self, joints: Mapping[str, float] | None = None) -> trimesh.Trimesh | None:
         """All parts as one mesh of several closed bodies; None if the rig describes none."""
@@ -52,219 +68,154 @@ class HandModel:
         joined: Any = trimesh.util.concatenate(parts) if parts else None
         return joined
 
+    def _read_urdf(self, path: Path, root: str | None) -> None:
+        """The links at and below `root`, which move with it; their kinematics are yourdfpy's."""
+        where = f"hand.urdf {path}"
+        self._robot = robot = _robot(path.expanduser(), where)
+        scene = robot.collision_scene
+        self._root = root or scene.graph.base_frame
+        if self._root not in robot.link_map:
+            names = ", ".join(robot.link_map)
+            raise SettingError(f"hand.root {root!r} is not one of {where}; accepted: {names}")
+        below = scene.graph.transforms.successors(self._root)
+        joints = [j for j in robot.robot.joints if j.parent in below and j.type in _MOVING]
+        drivers = (joint.mimic.joint if joint.mimic else joint.name for joint in joints)
+        self.joint_names = tuple(dict.fromkeys(drivers))
+        for node in scene.graph.nodes_geometry:
+            if node in below:
+                link = scene.graph.transforms.parents[node]
+                mesh = scene.geometry[scene.graph.get(node)[1]]
+                self._links.append((node, self._solid(mesh, f"{where}: a mesh of link {link}")))
+        if not self._links:
+            raise SettingError(
+                f"{where} has no collision shape at or below link {self._root}; accepted: one"
+            )
 
-def _box(box: BoxRig) -> trimesh.Trimesh:
+    def _solid(self, mesh: Any, name: str) -> trimesh.Trimesh:
+        """A closed solid, turned outward: a mesh, or its convex hull if it is open."""
+        import trimesh
+
+        solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
+        if not (solid.is_watertight and solid.is_winding_consistent and solid.volume != 0.0):
+            self.warnings.append(f"{name} is open; its convex hull is used")
+            solid = solid.convex_hull
+        if solid.volume < 0.0:
+            solid.invert()
+        return solid
+
+
+def box_mesh(box: BoxRig) -> trimesh.Trimesh:
+    """A closed box in the frame of its position, metres."""
     import trimesh
 
     hand_from_box = compose(roll_pitch_yaw(np.array(box.rotation)), np.array(box.position))
     return trimesh.creation.box(box.size, hand_from_box)
 
 
-class _Linkage:
-    """The links of a URDF at and below `root`, which move with it; kinematics by yourdfpy."""
-
-    def __init__(self, path: Path, root: str | None) -> None:
-        self._where = f"hand.urdf {path}"
-        path = path.expanduser()
-        robot = self._read(path)
-        links = {link.name: link for link in robot.links}
-        joints = {joint.name: joint for joint in robot.joints}
-        self._check_joints(robot.joints, links)
-        self._root = self._chosen_root(root, [link.name for link in robot.links], robot.joints)
-        below = [self._root]
-        for link in below:  # grows while it is walked
-            below += [joint.child for joint in robot.joints if joint.parent == link]
-        robot.links = [links[name] for name in below]
-        robot.joints = [joint for name in below for joint in robot.joints if joint.parent == name]
-        moving = [joint for joint in robot.joints if joint.type in _MOVING]
-        self._drivers = {joint.name: self._driver(joint, joints) for joint in moving}
-        self.joint_names = tuple(dict.fromkeys(name for name, _, _ in self._drivers.values()))
-        self.warnings = [
-            f"{self._where}: joint {joint.name} is {joint.type}; it stays at its origin"
-            for joint in robot.joints
-            if joint.type not in (*_MOVING, "fixed")
-        ]
-        self._shapes = [
-            (link.name, self._solid(collision, path, f"{self._where} link {link.name}"))
-            for link in robot.links
-            for collision in link.collisions
-        ]
-        if not self._shapes:
-            raise self._error(
-                f"has no collision shape at or below link {self._root}; accepted: at least one"
-            )
-        self._model = self._kinematics(robot)
-
-    def solids(self, joints: Mapping[str, float]) -> list[trimesh.Trimesh]:
-        """Closed solids in the root's frame; joints: values, radians or metres, 0 if missing."""
-        values = {
-            name: joints[name] if name in joints else factor * joints.get(driver, 0.0) + offset
-            for name, (driver, factor, offset) in self._drivers.items()
-        }
-        self._model.update_cfg(values)
-        return [
-            mesh.copy().apply_transform(self._model.get_transform(link, self._root))
-            for link, mesh in self._shapes
-        ]
-
-    def _read(self, path: Path) -> Any:
-        """The file as a Robot of yourdfpy: its links and joints."""
-        if not path.is_file():
-            kind = "is a folder" if path.is_dir() else "does not exist"
-            raise self._error(f"{kind}; accepted: a URDF file")
-        try:
-            from yourdfpy import URDF  # optional: rigs of boxes need none
-        except ImportError:
-            raise self._error(
-                "needs the package yourdfpy; install it where the project is: "
-                "pip install -e '.[sensors]'"
-            ) from None
-        content = path.read_bytes()
-        if b"<xacro:" in content:
-            raise self._error("holds xacro macros; accepted: what the tool xacro makes")
-        try:
-            ElementTree.fromstring(content)  # yourdfpy logs what is wrong, and goes on
-            file = io.BytesIO(content)
-            robot = URDF.load(file, build_scene_graph=False, load_meshes=False).robot
-        except Exception as error:  # it raises whatever it stumbles over
-            raise self._error(
-                f"is not a URDF ({type(error).__name__}: {_one_line(error)}); accepted: a robot of "
-                "links and joints with all their attributes"
-            ) from None
-        return robot
-
-    def _check_joints(self, joints: list[Any], links: Mapping[str, Any]) -> None:
-        for joint in joints:
-            if not {joint.parent, joint.child} <= links.keys():
-                raise self._error(
-                    f"joint {joint.name} joins {joint.parent!r}, {joint.child!r}; accepted: links"
-                )
-            if joint.type not in _TYPES:
-                raise self._error(f"joint {joint.name} has type {joint.type!r}; accepted: {_TYPES}")
-            if joint.type in _MOVING and not (len(joint.axis) == 3 and np.any(joint.axis)):
-                raise self._error(f"joint {joint.name}: axis is {joint.axis}; accepted: x y z")
-
-    def _chosen_root(self, root: str | None, links: list[str], joints: list[Any]) -> str:
-        children = [joint.child for joint in joints]
-        bases = [name for name in links if name not in children]
-        if len(set(links)) < len(links) or len(set(children)) < len(children) or not bases:
-            raise self._error("is not a tree; accepted: each link once, with one parent at most")
-        accepted = bases if root is None and len(bases) > 1 else links
-        if root not in accepted and (root is not None or len(bases) > 1):
-            raise SettingError(
-                f"hand.root {root!r} is not one of {self._where}; accepted: {', '.join(accepted)}"
-            )
-        return root or bases[0]
-
-    def _driver(self, joint: Any, joints: Mapping[str, Any]) -> tuple[str, float, float]:
-        """The joint at the end of a chain of mimics, and the factor and offset from its value."""
-        name, factor, offset = joint.name, 1.0, 0.0
-        for _ in joints:
-            if joint.mimic is None:
-                return joint.name, factor, offset
-            mimicked = joint.mimic.joint
-            if mimicked not in joints:
-                break
-            offset += factor * joint.mimic.offset
-            factor *= joint.mimic.multiplier
-            joint = joints[mimicked]
-        raise self._error(
-            f"joint {name} mimics {mimicked!r}; accepted: another joint, which does not in turn "
-            "mimic it"
-        )
-
-    def _kinematics(self, robot: Any) -> Any:
-        """The model whose transforms follow from values of joints.
-
-        yourdfpy follows one mimic alone, looks up another joint's value after a planar or floating
-        one, and moves prismatic joints by the length of their axes: values are resolved here.
-        """
-        from yourdfpy import URDF
-
+def _robot(path: Path, where: str) -> Any:
+    """The model of a URDF, with the meshes of its collision shapes."""
+    if not path.is_file():
+        raise SettingError(f"{where} does not exist; accepted: a URDF file")
+    try:
+        from yourdfpy import URDF  # optional: rigs of boxes need none
+    except ImportError:
+        raise SettingError(
+            f"{where} needs the package yourdfpy; install it where the project is: "
+            "pip install -e '.[sensors]'"
+        ) from None
+    content = path.read_bytes()
+    if b"<xacro:" in content:
+        raise SettingError(f"{where} holds xacro macros; accepted: what the tool xacro makes")
+    try:
+        ElementTree.fromstring(content)  # yourdfpy logs what is wrong, and goes on
+        robot = URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+        leaders = {j.name for j in robot.joints if j.type in _MOVING and j.mimic is None}
         for joint in robot.joints:
-            joint.mimic = None
-            if joint.type in _MOVING:
-                joint.axis = joint.axis / np.sqrt((joint.axis**2).sum())
-        for link in robot.links:
-            link.visuals = []
-        return URDF(robot, load_meshes=False)
-
-    def _solid(self, collision: Any, urdf: Path, where: str) -> trimesh.Trimesh:
-        """The closed solid of a Collision of yourdfpy in its link's frame."""
-        import trimesh
-
-        shape = collision.geometry
-        if shape.mesh is not None:
-            solid = self._mesh(shape.mesh, urdf, where)
-        elif shape.box is not None:
-            solid = trimesh.creation.box(_sizes(where, *shape.box.size))
-        elif shape.sphere is not None:
-            (radius,) = _sizes(where, shape.sphere.radius)
-            solid = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-        else:
-            radius, height = _sizes(where, shape.cylinder.radius, shape.cylinder.length)
-            solid = trimesh.creation.cylinder(radius, height, sections=_CYLINDER_SIDES)
-        if collision.origin is not None:
-            solid.apply_transform(collision.origin)
-        if not np.isfinite(solid.vertices).all():
-            raise SettingError(f"{where}: a collision shape is not finite")
-        return solid
-
-    def _mesh(self, described: Any, urdf: Path, where: str) -> trimesh.Trimesh:
-        """The closed solid in a file; its convex hull if it is open."""
-        import trimesh
-
-        path = _mesh_file(described.filename or "", urdf, where)
-        try:
-            loaded: Any = trimesh.load(
-                str(path), force="mesh", process=False, skip_materials=True, ignore_broken=True
-            )
-            mesh = trimesh.Trimesh(loaded.vertices, loaded.faces, process=False)
-            mesh.merge_vertices()
-            closed = mesh.is_watertight and mesh.is_winding_consistent and mesh.volume != 0.0
-            mesh = mesh if closed else mesh.convex_hull
-        except Exception as error:  # readers of damaged files raise whatever they stumble over
-            raise SettingError(
-                f"{where}: mesh {path} cannot be read, or is no solid: {_one_line(error)}"
-            ) from None
-        if not closed:
-            self.warnings.append(f"{where}: mesh {path} is open; its convex hull is used")
-        if mesh.volume < 0.0:
-            mesh.invert()
-        if described.scale is not None:
-            scale = np.broadcast_to(described.scale, (3,))
-            mesh.apply_transform(np.diag([*scale, 1.0]))
-        return mesh
-
-    def _error(self, text: str) -> SettingError:
-        return SettingError(f"{self._where} {text}")
+            if joint.mimic is not None and joint.mimic.joint not in leaders:
+                raise ValueError(
+                    f"joint {joint.name} mimics {joint.mimic.joint}, which no value has"
+                )
+            if joint.type not in _MOVING:  # planar and floating ones would shift others' values
+                joint.type = "fixed"
+            joint.axis = joint.axis / np.sqrt((joint.axis**2).sum())
+        return URDF(
+            robot,
+            build_scene_graph=False,
+            build_collision_scene_graph=True,
+            load_meshes=False,
+            load_collision_meshes=True,
+            force_collision_mesh=False,
+            filename_handler=partial(_mesh_file, folder=path.resolve().parent),
+        )
+    except Exception as error:  # it raises whatever it stumbles over
+        reason = " ".join(str(error).split())[:200]
+        raise SettingError(
+            f"{where} cannot be read ({type(error).__name__}: {reason}); accepted: a URDF, a tree "
+            "of links and joints with all their attributes, and its meshes"
+        ) from None
 
 
-def _mesh_file(name: str, urdf: Path, where: str) -> Path:
+def _mesh_file(fname: str, folder: Path) -> str:
     """The path of a mesh; a package is one of the folders above the URDF, or in one."""
-    folder = urdf.resolve().parent
-    scheme, _, rest = name.partition("://")
-    if not rest:
-        tried = [folder / name]
-    elif scheme == "file":
-        tried = [Path(rest)]
-    else:
-        within = PurePosixPath(*PurePosixPath(rest).parts[1:])
-        above = (folder, *folder.parents)
-        tried = [parent / part for parent in above for part in (within, rest)]
-    for path in tried:
-        if path.is_file():
-            return path
-    places = ", ".join(map(str, tried[:5]))
-    raise SettingError(f"{where}: mesh {name} does not exist; looked for {places}")
+    name = fname.rpartition("://")[2]
+    for parent in (folder, *folder.parents):
+        for path in (parent / name, parent / name.partition("/")[2]):
+            if path.is_file():
+                return str(path)
+    raise FileNotFoundError(f"mesh {fname} does not exist in or above {folder}")
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
+class HandPath:
+    """Where the hand was, probe by probe, and the free space that follows."""
 
+    def __init__(
+        self, rig: HandRig, model: HandModel, joints: JointHistory, times: IntArray, cell: RobotCell
+    ) -> None:
+        """times (T,): of all transforms, nanoseconds, ascending."""
+        self._frame, self._model, self._joints, self._times = rig.frame, model, joints, times
+        self._cell = cell
+        self._filled: dict[bytes, FloatArray] = {}  # points in each part, by its vertices
 
-def _sizes(where: str, *sizes: float) -> list[float]:
-    """The measures of a shape, metres, all above 0."""
-    if not all(size > 0.0 for size in sizes):
-        raise SettingError(f"{where}: size {sizes} of a shape; accepted: above 0")
-    return list(sizes)
+    def follow(self, window: ProbeWindow, counts: Counts) -> FloatArray:
+        """Sweep the hand along the path of a probe; some of its poses (P, 4, 4), in their order."""
+        shown = [np.zeros((0, 4, 4))]
+        states = self._joints.during(window.opens, window.closes)
+        ends = [time for time, _ in states[1:]] + [window.closes]
+        for (begin, joints), end in zip(states, ends, strict=True):
+            interior = self._interior(joints)
+            reach = float(np.sqrt((interior**2).sum(axis=1).max(initial=0.0)))
+            for poses in self._runs(begin, end, counts):
+                # No interior point moves by more than half a voxel from one pose to the next.
+                dense = poses_between(poses, step=0.5 * self._cell.spacing, radius=reach)
+                if len(interior):
+                    counts.free += self._cell.free.grid.at(interior, poses=dense)
+                shown.append(dense)
+        path = np.concatenate(shown)
+        count = min(len(path), MOST_POSES)
+        return path[np.linspace(0, len(path) - 1, count).astype(int)]
+
+    def _runs(self, begin: int, end: int, counts: Counts) -> Iterator[FloatArray]:
+        """Poses (P, 4, 4) from a time to before another, cut where they are not known for long."""
+        times = self._times[slice(*np.searchsorted(self._times, (begin, end)))]
+        cell = self._cell
+        for start in range(0, len(times), _BATCH):
+            # One pose of the batch before, so that nothing is missing between them.
+            stamps = times[max(start - 1, 0) : start + _BATCH]
+            poses, known = cell.tree.lookups(cell.world, self._frame, stamps, gap_s=cell.gap)
+            counts.images += len(stamps)
+            counts.used += int(known.sum())
+            counts.lost += int(len(stamps) - known.sum())
+            cuts = np.flatnonzero(np.diff(stamps[known]) > cell.gap * 1e9) + 1
+            yield from (run for run in np.split(poses[known], cuts) if len(run))
+
+    def _interior(self, joints: dict[str, float]) -> FloatArray:
+        """Points (M, 3) in the hand, dense enough to miss no voxel."""
+        before, self._filled = self._filled, {}
+        side = 0.5 * self._cell.spacing
+        for part in self._model.parts(joints):
+            place = np.asarray(part.vertices).tobytes()
+            known = before.get(place)
+            self._filled[place] = interior_lattice(part, side) if known is None else known
+        nodes = np.concatenate([np.zeros((0, 3)), *self._filled.values()])
+        lattice = Lattice((0.0, 0.0, 0.0), side)
+        return lattice.centres(np.unique(lattice.voxels(nodes), axis=0))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import sqrt
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -27,6 +28,8 @@ from runners.sensors.log.messages import ImageMessage
 from runners.sensors.rig import BubbleRig, ContactRig
 from runners.sensors.session_report import Counts
 
+REACH = 0.1  # m: of the membrane from its camera, for how far a turn moves it
+
 
 def membrane_reference(
     rig: BubbleRig, samples: list[np.ndarray], camera: PinholeCamera, beside: Path
@@ -46,13 +49,12 @@ def membrane_reference(
             f"{rig.name} has images of {rig.kind} and no reference; accepted: reference=FILE, the "
             "depth of its untouched membrane, or a log of depth that begins before its first probe"
         )
-    shape = (camera.height, camera.width)
     for image in images:
-        if image.shape != shape:
+        if image.shape != (camera.height, camera.width):
             height, width = image.shape
             raise SessionError(
                 f"the reference of {rig.name} has {width} x {height} pixels; accepted: those of "
-                f"its camera, {shape[1]} x {shape[0]}"
+                f"its camera, {camera.width} x {camera.height}"
             )
     depths = np.stack([metres(image, rig.unit) for image in images])
     known = valid_pixels(depths, nearest=rig.range[0], furthest=rig.range[1])
@@ -64,9 +66,6 @@ def membrane_reference(
         )
     middle = np.ma.median(np.ma.masked_array(depths, ~known), axis=0)
     return np.where(often, np.ma.filled(middle, 0.0), 0.0)
-
-
-REACH = 0.1  # m: of the membrane from its camera, for how far a turn moves it
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +95,8 @@ class Imprint:
 class Pad:
     """One pad; its contact is that of the image with the most pixels in contact (Sec. V-B)."""
 
+    reads: ClassVar[type] = ImageMessage
+
     def __init__(
         self,
         rig: BubbleRig,
@@ -103,73 +104,50 @@ class Pad:
         camera: PinholeCamera,
         reference: FloatArray,
         cell: RobotCell,
-        *,
-        inside: bool,
     ) -> None:
-        """reference (H, W): depth of the untouched membrane, metres, 0 where it is not known.
-
-        inside: whether the way from the camera to the membrane is free.
-        """
+        """reference (H, W): depth of the untouched membrane, metres, 0 where it is not known."""
         self._rig, self._contact, self._cell = rig, contact, cell
-        self._camera, self._reference, self._inside = camera, reference, inside
+        self._camera, self._reference = camera, reference
         self._lengths = np.sqrt((camera.directions() ** 2).sum(axis=-1))
         self._last_pose: FloatArray | None = None
         self._best: Imprint | None = None
 
-    def take(
-        self, time: int, message: ImageMessage, counts: Counts, *, within: bool
-    ) -> Imprint | None:
+    def take(self, time: int, message: ImageMessage, counts: Counts, *, within: bool) -> None:
         """Use an image of the current probe; `within` its begin and end, contacts count."""
         counts.images += 1
         imprint = self._imprint(time, message, counts)
         if imprint is None:
-            return None
-        used = within
+            return
+        moved = self._has_moved(imprint.view.world_from_camera)
         if within and imprint.outweighs(self._best):
             self._best = imprint
-        if self._inside and self._has_moved(imprint.view.world_from_camera):
+        if moved:
             self._mark(imprint.view, counts)
-            used = True
-        counts.used += used
-        counts.spared += not used
-        return imprint
+        counts.used += within or moved
+        counts.spared += not (within or moved)
 
     def strongest(self, counts: Counts) -> Imprint | None:
         """The image of the contact since the last call."""
         best, self._best = self._best, None
-        if best is None:
-            return None
-        counts.touching += best.size
-        if self._inside:
+        if best is not None:
+            counts.touching += best.size
             self._mark(best.view, counts)
         return best
 
     def image(self, step: int, imprint: Imprint) -> SensorImage:
         """The deformation with the pixels in contact."""
-        return recorded_image(
-            step,
-            self._rig.name,
-            "deformation",
-            imprint.pressed,
-            imprint.view.valid & (imprint.pressed > 0.0),
-            imprint.touching,
-            self._camera,
-            imprint.view.world_from_camera,
-        )
+        valid = imprint.view.valid & (imprint.pressed > 0.0)
+        pressed = View(imprint.pressed, valid, self._camera, imprint.view.world_from_camera)
+        return recorded_image(step, self._rig.name, "deformation", pressed, imprint.touching)
 
-    def contacts(self, imprint: Imprint, chosen: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        """Points (C, 3) and outward normals (C, 3) of the object, of chosen (C,) contact pixels."""
+    def contacts(self, imprint: Imprint, chosen: np.ndarray) -> FloatArray:
+        """Points and outward normals of the object (C, 6), of chosen (C,) contact pixels."""
         view, touching = imprint.view, imprint.touching
         points = self._camera.back_project(view.metres)[touching][chosen]
         filled = np.where(view.valid, view.metres, self._reference)
         normals = self._normals(smooth(filled, self._contact.filter))[touching][chosen]
         pose = view.world_from_camera
-        return apply(pose, points), rotated(pose[:3, :3], normals)
-
-    def membrane(self, view: View) -> FloatArray:
-        """All points (N, 3) of the membrane in the world."""
-        points = self._camera.back_project(view.metres)[view.valid]
-        return apply(view.world_from_camera, points)
+        return np.concatenate([apply(pose, points), rotated(pose[:3, :3], normals)], axis=1)
 
     def _imprint(self, time: int, message: ImageMessage, counts: Counts) -> Imprint | None:
         view = view_of(message, time, self._rig, self._camera, self._cell, counts)
@@ -184,7 +162,7 @@ class Pad:
             valid = measured & (depth >= nearest) & (depth <= furthest)
             kept = self._main(depth, valid, counts)
             pressed[valid & ~kept] = 0.0
-            valid, view = kept, View(depth, kept, view.world_from_camera)
+            valid, view = kept, View(depth, kept, self._camera, view.world_from_camera)
         else:
             valid = self._main(view.metres, view.valid & known, counts)
             pressed = deformation(self._reference, view.metres, valid=valid)
@@ -192,14 +170,12 @@ class Pad:
             counts.unusable += 1
             self._cell.warnings.warn(f"{self._rig.name}: an image without a pixel that counts")
             return None
-        pressed = smooth(pressed, self._contact.filter)
+        contact = self._contact
+        pressed = smooth(pressed, contact.filter)
         touching = contact_mask(
-            pressed,
-            quantile=self._contact.quantile,
-            threshold=self._contact.threshold,
-            valid=valid,
+            pressed, quantile=contact.quantile, threshold=contact.threshold, valid=valid
         )
-        touching = self._main(view.metres, touching, counts, least=self._contact.pixels)
+        touching = self._main(view.metres, touching, counts, least=contact.pixels)
         return Imprint(view, pressed, touching)
 
     def _main(
@@ -218,16 +194,11 @@ class Pad:
 
     def _mark(self, view: View, counts: Counts) -> None:
         """The pad's inside is free, less half a voxel's diagonal before what it may touch."""
-        margin = sqrt(0.75) * self._cell.spacing
-        depth = view.metres - margin / self._lengths
-        with self._cell.free.by(counts) as grid:
-            grid.from_depth(
-                depth,
-                self._camera,
-                view.world_from_camera,
-                view.valid & (depth > 0.0),
-                fraction=1.0,
-            )
+        depth = view.metres - sqrt(0.75) * self._cell.spacing / self._lengths
+        inside, pose = view.valid & (depth > 0.0), view.world_from_camera
+        counts.free += self._cell.free.grid.from_depth(
+            depth, self._camera, pose, inside, fraction=1.0
+        )
 
     def _has_moved(self, pose: FloatArray) -> bool:
         """Whether the membrane is half a voxel away from where it was last marked."""

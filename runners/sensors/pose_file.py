@@ -1,4 +1,4 @@
-"""Files that say where the object of a session is, beside the session's log or recording."""
+"""YAML files from outside, and those that say where the object of a session is, beside its log."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import yaml
 
 from chsel.errors import ChselError, SessionError
 from chsel.numerics.arrays import FloatArray, frozen
+from chsel.problem.file_checks import refuse_special_file
 from chsel.problem.poses import nearest_rigid
 from replay.files import new_file, whole_file
-from runners.sensors.yaml_file import read_yaml
 
 SUFFIX = ".pose.yaml"
 KEY = "world_from_object"
@@ -21,6 +21,20 @@ _ACCEPTED = (
     f"accepted: YAML with {KEY}, four rows of four numbers: a rotation and a position in metres, "
     "last row 0 0 0 1"
 )
+
+
+def read_yaml(path: Path) -> dict[Any, Any]:
+    """The mapping in a file. Raises SessionError, whose text begins after the name of the file."""
+    refuse_special_file("it", path, SessionError)
+    try:
+        values = yaml.safe_load(path.read_bytes())
+    except OSError as error:
+        raise SessionError(f"cannot be read ({error.strerror or error})") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise SessionError(f"not YAML ({' '.join(str(error).split())[:100]})") from None
+    if not isinstance(values, dict):
+        raise SessionError("no mapping of keys to values")
+    return values
 
 
 def beside(path: str | Path) -> Path:

@@ -24,14 +24,12 @@ def _fits(accepted: str, is_accepted: Callable[[Any], bool]) -> Check:
 
 def _points(name: str, value: Any) -> None:
     """Finite points."""
-    for index, point in enumerate(value):
-        frozen(f"{name}[{index}]", point, (3,), error=SettingError)
+    frozen(name, value, (None, 3), error=SettingError)
 
 
 Vector = tuple[float, float, float]
 Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 Name = Annotated[str, _fits("letters, digits and _", lambda name: name.replace("_", "").isalnum())]
-Unit = Annotated[float | None, positive]
 Depths = Annotated[
     tuple[float, float],
     _fits("[nearest, furthest], metres", lambda depths: 0.0 <= depths[0] < depths[1]),
@@ -42,35 +40,37 @@ Quantile = Annotated[float, _fits("from 0 to below 1", lambda part: 0.0 <= part 
 
 
 @dataclass(frozen=True)
-class CameraRig(CheckedSettings):
-    """A depth camera that looks at the workspace; its rays are free (CHSEL, Sec. V-B)."""
+class ImageRig(CheckedSettings):
+    """Whatever sends depth images."""
 
     name: Name
     depth: str  # topic of its images
     info: str  # topic of its intrinsics
     frame: str | None = None  # of the optical centre; null: that of the messages
-    unit: Unit = None  # metres a unit of the image; null: 0.001 for integers, else 1
+    unit: Annotated[float | None, positive] = None
+    """Metres a unit of the image; null: 0.001 for integers, else 1."""
+
     range: Depths = (0.2, 5.0)  # metres, depths beyond are invalid
+
+
+@dataclass(frozen=True)
+class CameraRig(ImageRig):
+    """A depth camera that looks at the workspace; its rays are free (CHSEL, Sec. V-B)."""
+
     fraction: Fraction = 0.95  # how far along its ray each depth is free
     edge: Annotated[float | None, positive] = 0.05
     """Metres; pixels within `edge_reach` pixels of a larger jump of depth are left out, as edges
     are measured badly; null: all pixels count."""
 
     rate: Annotated[float | None, positive] = 2.0  # images a second at most; null: all
-
     views: Annotated[int, positive] = 1  # in so many images a voxel must have been seen to be free
     edge_reach: Annotated[int, positive] = 5  # pixels
 
 
 @dataclass(frozen=True)
-class BubbleRig(CheckedSettings):
+class BubbleRig(ImageRig):
     """A soft-bubble pad: a depth camera behind a membrane that gives way (CHSEL, Sec. V-B)."""
 
-    name: Name
-    depth: str  # topic of its images
-    info: str  # topic of its intrinsics
-    frame: str | None = None  # as of a camera
-    unit: Unit = None
     range: Depths = (0.01, 0.5)
     kind: Annotated[str, one_of("depth", "deformation")] = "depth"
     """Whether its images are of depth, whose change against a reference is the deformation, or of
@@ -92,11 +92,8 @@ class ContactRig(CheckedSettings):
 
     threshold: Annotated[float, positive] = 0.004  # metres
     pixels: Annotated[int, positive] = 6  # fewer of them are no contact
-    points: Annotated[int, positive] = 50  # of a contact at most, a random subset
-    per: Annotated[str, one_of("contact", "camera")] = "contact"
-    """Whether `points` are those of a contact, which the pads share, or of each camera."""
-
-    reference_images: Annotated[int, positive] = 10  # so many make up a missing reference
+    points: Annotated[int, positive] = 50
+    """Of a contact at most, a random subset, which the pads share."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +112,7 @@ class BoxRig:
 
 
 @dataclass(frozen=True)
-class HandRig(CheckedSettings):
+class HandRig:
     """The hand, whose way is free space."""
 
     frame: str  # its transform frame
@@ -124,9 +121,6 @@ class HandRig(CheckedSettings):
     urdf: str | None = None  # file whose links' collision shapes belong to the hand
     root: str | None = None  # the link of the urdf that is `frame`; null: its base
     joints: str | None = None  # topic of the joints that pose the links
-    sweep: Annotated[str, one_of("path", "backwards")] = "path"
-    """All of the path, or as the reference the pads' surfaces and what is between them, drawn
-    backwards along the hand's z axis."""
 
 
 @dataclass(frozen=True)
@@ -202,10 +196,7 @@ class ExtraContacts(CheckedSettings):
     """Contacts that no sensor measured."""
 
     probe: int
-    points: Annotated[tuple[Vector, ...], _points] = ()  # (C, 3), metres, world
-    foremost: Annotated[int, not_negative] = 0
-    """The mean of so many points of the bubbles, those furthest along the hand's z axis at the end
-    of the probe's push."""
+    points: Annotated[tuple[Vector, ...], _points]  # (C, 3), metres, world
 
 
 @dataclass(frozen=True)
@@ -227,9 +218,6 @@ class ClockRig(CheckedSettings):
 
     gap: Annotated[float, positive] = 0.5
     """Seconds between two transforms over which none is interpolated."""
-
-    jump: Annotated[float, positive] = 10.0
-    """Seconds by which the log's time may step before it is reported."""
 
 
 @dataclass(frozen=True)
@@ -276,7 +264,7 @@ class Rig(CheckedSettings):
             )
 
     @property
-    def sensors(self) -> tuple[CameraRig | BubbleRig, ...]:
+    def sensors(self) -> tuple[ImageRig, ...]:
         """All that send depth images: the cameras, then the pads."""
         return (*self.cameras, *self.bubbles)
 

@@ -42,15 +42,10 @@ class Counts:
         total = f"{self.pixels} pixels or points" if self.pixels else f"{self.images} messages"
         return f"left out of {total}: {counts}" if counts else ""
 
-    def add(self, other: Counts) -> None:
-        """Add the counts of another one."""
-        for name, value in vars(other).items():
-            setattr(self, name, getattr(self, name) + value)
-
 
 @dataclass
 class Report:
-    """Tallies of a session by step and by the name of a sensor, and its lines of text."""
+    """Counts of a session by step and by the name of a sensor, and its lines of text."""
 
     by_probe: dict[int, dict[str, Counts]] = field(default_factory=dict)
     lines: list[tuple[str, str]] = field(default_factory=list)
@@ -61,15 +56,11 @@ class Report:
 
     def total(self) -> dict[str, Counts]:
         """By sensor, over all probes."""
-        totals: dict[str, Counts] = {}
+        totals: dict[str, Counter[str]] = {}
         for by_sensor in self.by_probe.values():
             for name, counts in by_sensor.items():
-                totals.setdefault(name, Counts()).add(counts)
-        return totals
-
-
-MOST_KINDS = 100  # what is wrong with messages may name their numbers
-LONGEST = 400  # characters of a line
+                totals.setdefault(name, Counter()).update(vars(counts))
+        return {name: Counts(**counts) for name, counts in totals.items()}
 
 
 class LogWarnings:
@@ -82,20 +73,15 @@ class LogWarnings:
     def warn(self, text: str, count: int = 1) -> None:
         """Something is wrong, or was left out; `count` times."""
         if count:
-            self._counts["warning", text[:LONGEST]] += count
+            self._counts["warning", text] += count
 
     def note(self, text: str) -> None:
         """Something worth knowing."""
-        self._counts["info", text[:LONGEST]] += 1
+        self._counts["info", text] += 1
 
     def lines(self) -> list[tuple[str, str]]:
         """Level and text of every kind; "(12 times)" stands behind what happened repeatedly."""
-        kinds = list(self._counts.items())
-        lines = [
+        return [
             (level, text if count == 1 else f"{text} ({count} times)")
-            for (level, text), count in kinds[:MOST_KINDS]
+            for (level, text), count in self._counts.items()
         ]
-        further = sum(count for _, count in kinds[MOST_KINDS:])
-        if further:
-            lines.append(("warning", f"further kinds of trouble ({further} times)"))
-        return lines

@@ -17,7 +17,7 @@ from replay.events import Logged, Probe, RigDescribed
 from replay.files import file_digest
 from runners.objects.loader import ObjectModel
 from runners.sensors.cell import FreeMap, RobotCell
-from runners.sensors.depth_camera import recorded_image
+from runners.sensors.depth_camera import View, recorded_image
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
 from runners.sensors.depth_frame import depth_frame_points, read_depth_frame
 from runners.sensors.first_pass import FirstPass
@@ -221,11 +221,10 @@ class DepthFrameSession:
         self.report.by_probe[0] = {camera.name: found.counts}
         yield RigDescribed(-1, self._rig.name, file_digest(self._path))
         if self._images:
-            depth = np.nan_to_num(self._frame.depth, posinf=0.0, neginf=0.0)
-            pose, pinhole = self._frame.world_from_camera, self._frame.camera
-            yield recorded_image(
-                0, camera.name, "depth", depth, depth > 0.0, found.rays, pinhole, pose
-            )
+            frame = self._frame
+            measured = np.isfinite(frame.depth) & (frame.depth > 0.0)
+            view = View(frame.depth, measured, frame.camera, frame.world_from_camera)
+            yield recorded_image(0, camera.name, "depth", view, found.rays)
         count = len(found.points.known)
         text = f"{count} points on the object's surface, {len(found.points.free)} free voxels"
         yield Logged(0, "info", text)

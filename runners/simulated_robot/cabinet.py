@@ -1,8 +1,13 @@
-"""The cabinet: what it is made of, how objects stand in it, and where they are probed."""
+"""The cabinet with its objects, and the hand that probes them.
+
+The hand is a wrist with two soft-bubble pads that point forward, side by side. Its frame `wrist`
+has z forward, along world +x; x points down and y to the left.
+"""
 
 from __future__ import annotations
 
-from math import pi
+from collections.abc import Sequence
+from math import cos, pi, sin
 from typing import Any
 
 import numpy as np
@@ -11,28 +16,35 @@ import trimesh
 from chsel.errors import SessionError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Workspace
-from chsel.problem.poses import apply, compose
+from chsel.problem.poses import apply, axis_angle, compose
+from runners.sensors.hand import box_mesh
 from runners.sensors.rig import BoxRig
 from runners.sessions.configurations import Configuration
 from runners.sessions.placement import laid_down
 
-Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+
+def _box(x: Sequence[float], y: Sequence[float], z: Sequence[float]) -> BoxRig:
+    """A box by its bounds along the world's axes."""
+    lower, upper = np.array([x, y, z]).T
+    (sx, sy, sz), (px, py, pz) = (upper - lower).tolist(), ((upper + lower) / 2.0).tolist()
+    return BoxRig((sx, sy, sz), (px, py, pz))
+
 
 # The inside is the workspace and 2 cm to its sides; the shelf is the workspace's lower face. The
 # side wall towards the camera and the front lip hide a part of the inside from it.
-CABINET: dict[str, Bounds] = {
-    "shelf": ((0.66, 1.14), (-0.24, 0.24), (0.29, 0.31)),
-    "ceiling": ((0.66, 1.14), (-0.24, 0.24), (0.62, 0.64)),
-    "back": ((1.12, 1.14), (-0.24, 0.24), (0.31, 0.62)),
-    "left_wall": ((0.66, 1.14), (0.22, 0.24), (0.31, 0.62)),
-    "right_wall": ((0.66, 1.14), (-0.24, -0.22), (0.31, 0.62)),
-    "front_lip": ((0.64, 0.66), (-0.24, 0.24), (0.27, 0.335)),
-}
-ROOM: dict[str, Bounds] = {
-    "floor": ((-1.0, 2.2), (-1.5, 1.6), (-0.05, 0.0)),
-    "far_wall": ((2.1, 2.2), (-1.5, 1.6), (0.0, 2.5)),
-    "other_wall": ((-1.0, 2.1), (1.5, 1.6), (0.0, 2.5)),
-}
+CABINET = (
+    _box((0.66, 1.14), (-0.24, 0.24), (0.29, 0.31)),  # shelf
+    _box((0.66, 1.14), (-0.24, 0.24), (0.62, 0.64)),  # ceiling
+    _box((1.12, 1.14), (-0.24, 0.24), (0.31, 0.62)),  # back
+    _box((0.66, 1.14), (0.22, 0.24), (0.31, 0.62)),  # left wall
+    _box((0.66, 1.14), (-0.24, -0.22), (0.31, 0.62)),  # right wall
+    _box((0.64, 0.66), (-0.24, 0.24), (0.27, 0.335)),  # front lip
+)
+ROOM = (
+    _box((-1.0, 2.2), (-1.5, 1.6), (-0.05, 0.0)),  # floor
+    _box((2.1, 2.2), (-1.5, 1.6), (0.0, 2.5)),  # far wall
+    _box((-1.0, 2.1), (1.5, 1.6), (0.0, 2.5)),  # other wall
+)
 
 CABINET_WORKSPACE = Workspace((0.7, -0.2, 0.31), (1.1, 0.2, 0.6))
 SHELF = 0.31  # m: height of its upper side
@@ -59,27 +71,10 @@ CAMERA_POSITION = (0.39, -0.40, 0.60)  # m: outside, beside the robot
 CAMERA_TARGET = (0.86, 0.02, 0.44)  # m: what is in the middle of its image
 
 
-def boxes(*groups: dict[str, Bounds]) -> trimesh.Trimesh:
-    """The boxes of groups such as CABINET as one mesh, in the world."""
-    parts = []
-    for bounds in (bounds for group in groups for bounds in group.values()):
-        lower, upper = np.array(bounds).T
-        part = trimesh.creation.box(upper - lower)
-        parts.append(part.apply_translation((lower + upper) / 2.0))
-    joined: Any = trimesh.util.concatenate(parts)
+def mesh_of(boxes: Sequence[BoxRig]) -> trimesh.Trimesh:
+    """Boxes as one mesh, metres."""
+    joined: Any = trimesh.util.concatenate([box_mesh(box) for box in boxes])
     return joined
-
-
-def solids() -> tuple[BoxRig, ...]:
-    """The boxes of CABINET, each by its size and centre, in the world."""
-    parts = []
-    for bounds in CABINET.values():
-        size = [upper - lower for lower, upper in bounds]
-        centre = [(upper + lower) / 2.0 for lower, upper in bounds]
-        parts.append(
-            BoxRig(size=(size[0], size[1], size[2]), position=(centre[0], centre[1], centre[2]))
-        )
-    return tuple(parts)
 
 
 def world_from_camera() -> FloatArray:
@@ -100,14 +95,62 @@ def stood_on_shelf(mesh: trimesh.Trimesh, configuration: Configuration) -> Float
     world_from_object = laid_down(mesh, configuration)
     world_from_object[2, 3] += SHELF
     placed = apply(world_from_object, np.asarray(mesh.vertices))
-    box, slack = configuration.workspace, 1e-6
-    if (placed.min(axis=0) < np.array(box.lower) - slack).any() or (
-        placed.max(axis=0) > np.array(box.upper) + slack
-    ).any():
+    lower, upper = np.add(configuration.workspace.bounds, [[-1e-6], [1e-6]])
+    if not ((placed >= lower) & (placed <= upper)).all():
         size = " x ".join(f"{side:.3g}" for side in np.ptp(placed, axis=0))
-        room = " x ".join(f"{side:.3g}" for side in np.subtract(box.upper, box.lower))
+        room = " x ".join(f"{side:.3g}" for side in upper - lower)
         raise SessionError(
             f"the object takes {size} m where {configuration.name} puts it, more than the cabinet "
             f"has; accepted: an object of real size (object.scale=1) that fits in {room} m"
         )
     return world_from_object
+
+
+ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+
+PADS = {"left": 1.0, "right": -1.0}  # on which side of the hand
+CAP = (0.042, 0.031, 0.022)  # m: semi-axes of a membrane, half an ellipsoid; x, y, z of its camera
+CAP_BASE = 0.055  # m: how far before the camera its rigid base is
+TILT = pi * 8.0 / 180.0  # rad: how far each pad is turned outward
+PAD_SIDE = 0.037  # m: from the middle of the hand to that of a pad's rigid base
+PAD_FRONT = 0.150  # m: how far before the wrist it is
+_HOUSING = (0.086, 0.064, 0.080)  # m: the box behind the membrane
+
+
+def world_from_wrist(position: FloatArray) -> FloatArray:
+    """Pose (4, 4) of the wrist at position (3,); its orientation never changes."""
+    return compose(ROTATION, position)
+
+
+def wrist_from_bubble_camera(pad: str) -> FloatArray:
+    """Pose (4, 4) of the camera that looks at a pad's membrane from inside, optical frame."""
+    rotation, base = _pad(PADS[pad])
+    return compose(rotation, base - CAP_BASE * rotation[:, 2])
+
+
+def rigid_parts() -> tuple[BoxRig, ...]:
+    """The solid parts of the hand, in its frame: arm, palm, and the pads without membranes."""
+    behind = _HOUSING[2] / 2.0
+    y, z = PAD_SIDE - behind * sin(TILT), PAD_FRONT - behind * cos(TILT)
+    return (
+        BoxRig(size=(0.08, 0.08, 0.30), position=(0.0, 0.0, -0.22)),
+        BoxRig(size=(0.09, 0.09, 0.10), position=(0.0, 0.0, -0.03)),
+        BoxRig(size=(0.086, 0.15, 0.05), position=(0.0, 0.0, 0.045)),
+        *(BoxRig(_HOUSING, (0.0, s * y, z), (-s * TILT, 0.0, 0.0)) for s in PADS.values()),
+    )
+
+
+def whole_mesh() -> trimesh.Trimesh:
+    """The hand with its membranes untouched, in the wrist's frame, metres."""
+    meshes = [mesh_of(rigid_parts())]
+    for side in PADS.values():
+        cap = trimesh.creation.icosphere(subdivisions=3).apply_scale(CAP)
+        meshes.append(cap.apply_transform(compose(*_pad(side))))
+    joined: Any = trimesh.util.concatenate(meshes)
+    return joined
+
+
+def _pad(side: float) -> tuple[FloatArray, FloatArray]:
+    """Rotation (3, 3) of a pad, z outward, and the middle (3,) of its base, in the hand."""
+    rotation = axis_angle(np.array([1.0, 0.0, 0.0]), -side * TILT)
+    return rotation, np.array([0.0, side * PAD_SIDE, PAD_FRONT])

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import heapq
-import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 from mcap.records import Schema
 from mcap_ros2.writer import Writer
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from chsel.numerics.arrays import FloatArray
@@ -32,14 +29,14 @@ class LogWriter:
         self._schemas: dict[str, Schema] = {}
         self._counts: Counter[str] = Counter()
         self._waiting: list[tuple[int, int, str, str, Mapping[str, Any], int]] = []
-        self.messages = 0
+        self._messages = 0
 
     def add(
         self, topic: str, kind: str, message: Mapping[str, Any], stamp: int, log_time: int
     ) -> None:
         """A message of a type of DEFINITIONS, sent at `stamp` and received at `log_time`."""
-        self.messages += 1
-        heapq.heappush(self._waiting, (log_time, self.messages, topic, kind, message, stamp))
+        self._messages += 1
+        heapq.heappush(self._waiting, (log_time, self._messages, topic, kind, message, stamp))
 
     def flush(self, now: int) -> None:
         """Write what was received until now."""
@@ -56,16 +53,10 @@ class LogWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         with self._file:
-            if kind is None:
-                self.flush(2**63)
-                self._writer.finish()
+            self.flush(2**63)
+            self._writer.finish()
 
 
 def header(frame: str, stamp: int) -> dict[str, Any]:
@@ -101,21 +92,9 @@ def image(frame: str, values: np.ndarray, stamp: int) -> dict[str, Any]:
     }
 
 
-def compressed_image(frame: str, values: np.ndarray, stamp: int) -> dict[str, Any]:
-    """A sensor_msgs/CompressedImage of depths (H, W), uint16, as PNG."""
-    file = io.BytesIO()
-    Image.fromarray(values).save(file, "png", compress_level=3)
-    return {
-        "header": header(frame, stamp),
-        "format": "16UC1; png compressed mono16",
-        "data": file.getvalue(),
-    }
-
-
 def camera_info(frame: str, camera: PinholeCamera, stamp: int) -> dict[str, Any]:
     """A sensor_msgs/CameraInfo of a camera without distortion."""
     cx, cy, fx, fy = camera.cx, camera.cy, camera.fx, camera.fy
-    region = dict.fromkeys(("x_offset", "y_offset", "height", "width", "do_rectify"), 0)
     return {
         "header": header(frame, stamp),
         "height": camera.height,
@@ -123,20 +102,11 @@ def camera_info(frame: str, camera: PinholeCamera, stamp: int) -> dict[str, Any]
         "distortion_model": "plumb_bob",
         "d": [0.0] * 5,
         "k": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
-        "r": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        "r": np.eye(3).ravel().tolist(),
         "p": [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
-        "binning_x": 0,
-        "binning_y": 0,
-        "roi": region,
     }
 
 
 def joint_state(names: Sequence[str], positions: Sequence[float], stamp: int) -> dict[str, Any]:
     """A sensor_msgs/JointState."""
-    return {
-        "header": header("", stamp),
-        "name": names,
-        "position": positions,
-        "velocity": [],
-        "effort": [],
-    }
+    return {"header": header("", stamp), "name": names, "position": positions}

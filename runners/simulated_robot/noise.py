@@ -8,9 +8,10 @@ from scipy import ndimage
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.streams import normals
 from chsel.sensing.depth_camera import PinholeCamera
-from runners.simulated_robot.settings import BubbleSettings, CameraSettings
 
 EDGE = 0.03  # m: a jump of depth among neighbours that is an occlusion edge
+NOISE = 0.0025  # m: standard deviation at 1 m; it grows with the depth squared
+BASELINE = 0.05  # m: between the two eyes of the outer camera
 NEAREST = 0.15  # m: the outer camera measures nothing nearer
 FURTHEST = 5.0  # m: nor further
 PATCH = 8  # pixels of 640: the size of the patches that a stereo camera matches
@@ -21,12 +22,13 @@ LOST_IN_SHADOW = 0.8  # where one eye sees what the other does not
 FLYING = 0.25  # of the pixels at edges
 _WIDTH = 640  # pixels, of the numbers above
 
+BUBBLE_NOISE = 0.0003  # m: standard deviation
 BUBBLE_STEP = 0.0001  # m: to which a bubble's camera rounds
 BUBBLE_LOST = 0.001
 
 
 def stereo_depth(
-    depth: FloatArray, pinhole: PinholeCamera, camera: CameraSettings, stream: np.random.Generator
+    depth: FloatArray, camera: PinholeCamera, stream: np.random.Generator
 ) -> np.ndarray:
     """What the outer camera measures of depths (H, W) in metres: uint16 millimetres, 0 for none.
 
@@ -34,8 +36,8 @@ def stereo_depth(
     reports the wrong side of it; some pixels at edges float between both sides; pixels that only
     one eye sees are mostly lost; and all depths are noisy by the square of their size.
     """
-    scale = pinhole.width / _WIDTH
-    shadow = _shadow(depth, pinhole.fx * camera.baseline)
+    scale = camera.width / _WIDTH
+    shadow = _shadow(depth, camera.fx * BASELINE)
     measured = _strayed(depth, PATCH * scale, STRAY * scale, stream)
     low, high = ndimage.minimum_filter(depth, 3), ndimage.maximum_filter(depth, 3)
     low, high = np.minimum(low, measured), np.maximum(high, measured)
@@ -43,18 +45,16 @@ def stereo_depth(
     chance, mix = stream.random((2, *depth.shape))
     flying = edge & (chance < FLYING)
     measured = np.where(flying, low + mix * (high - low), measured)
-    measured = measured + camera.noise * measured**2 * normals(stream, depth.shape)
+    measured = measured + NOISE * measured**2 * normals(stream, depth.shape)
     chance = stream.random(depth.shape)
     lost = chance < np.where(shadow, LOST_IN_SHADOW, np.where(edge, LOST_AT_EDGES, LOST))
     lost |= (measured < NEAREST) | (measured > FURTHEST)
     return np.where(lost, 0.0, np.rint(measured * 1000.0)).astype(np.uint16)
 
 
-def bubble_depth(
-    depth: FloatArray, bubbles: BubbleSettings, stream: np.random.Generator
-) -> np.ndarray:
+def bubble_depth(depth: FloatArray, stream: np.random.Generator) -> np.ndarray:
     """What a bubble's camera measures of depths (H, W) in metres: float32 metres, 0 for none."""
-    measured = depth + bubbles.noise * normals(stream, depth.shape)
+    measured = depth + BUBBLE_NOISE * normals(stream, depth.shape)
     measured = np.rint(measured / BUBBLE_STEP) * BUBBLE_STEP
     return np.where(stream.random(depth.shape) < BUBBLE_LOST, 0.0, measured).astype(np.float32)
 

@@ -10,15 +10,15 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, inverse
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.rig import ContactRig
-from runners.simulated_robot import wrist
+from runners.simulated_robot.cabinet import CAP, CAP_BASE, PADS, wrist_from_bubble_camera
 from runners.simulated_robot.physics_scene import PhysicsScene
 from runners.simulated_robot.settings import RenderedCamera
-from runners.simulated_robot.wrist import CAP, CAP_BASE
 
 THICKNESS = 0.001  # m: how much nearer than its base it can never be pressed
 TAUTNESS = 0.003  # m: beside what presses, the dent falls by 1/e over this length
 _SWEEPS = 30  # of relaxation, which leave an error of 0.1 %
 _MARGIN = 0.025  # m: around what presses, beyond which there is no dent worth a number
+_SPACING = 0.004  # m: between the points of the surface that are looked at first
 
 
 class Membrane:
@@ -41,10 +41,8 @@ class Membrane:
         if not pressing.any():
             return self.rest
         rows, columns = _around(pressing > 0.0, self._margin)
-        least, most = pressing[rows, columns], self._most[rows, columns]
-        dent = self._hung(least, most)
         depth = self.rest.copy()
-        depth[rows, columns] -= dent
+        depth[rows, columns] -= self._hung(pressing[rows, columns], self._most[rows, columns])
         return depth
 
     def _hung(self, least: FloatArray, most: FloatArray) -> FloatArray:
@@ -83,9 +81,6 @@ def _around(pixels: np.ndarray, margin: int) -> tuple[slice, slice]:
     )
 
 
-_SPACING = 0.004  # m: between the points of the surface that are looked at first
-
-
 class Pads:
     """Both membranes against one object; images are rendered only where it may touch them."""
 
@@ -99,32 +94,24 @@ class Pads:
         """mesh: in its own frame, metres."""
         fine, _ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _SPACING, max_iter=20)
         self._surface = apply(world_from_object, np.unique(fine, axis=0))
-        self._scene = scene
-        self._camera = camera
-        self._membrane = Membrane(camera)
-        self._contact = ContactRig()
+        self._scene, self._camera, self._membrane = scene, camera, Membrane(camera)
 
     def depths(self, world_from_wrist: FloatArray) -> dict[str, FloatArray]:
         """Depth (H, W) in metres of each pad's membrane, pressed or not."""
-        return {pad: self._depth(world_from_wrist, pad) for pad in wrist.PADS}
-
-    def pressed(self, depths: dict[str, FloatArray]) -> dict[str, int]:
-        """How many pixels of each pad are dented beyond the robot's threshold, as it filters."""
-        counts = {}
-        for pad, depth in depths.items():
-            dent = ndimage.uniform_filter(self._membrane.rest - depth, self._contact.filter)
-            counts[pad] = int((dent > self._contact.threshold).sum())
-        return counts
+        depths = {}
+        for pad in PADS:
+            world_from_camera = world_from_wrist @ wrist_from_bubble_camera(pad)
+            depths[pad] = self._membrane.rest
+            if self._near(world_from_camera):
+                beyond = self._scene.depth(self._camera, world_from_camera)
+                depths[pad] = self._membrane.pressed(beyond)
+        return depths
 
     def touches(self, depths: dict[str, FloatArray]) -> bool:
-        """Whether so many pixels of a pad are dented that the robot stops."""
-        return max(self.pressed(depths).values()) >= self._contact.pixels
-
-    def _depth(self, world_from_wrist: FloatArray, pad: str) -> FloatArray:
-        world_from_camera = world_from_wrist @ wrist.wrist_from_bubble_camera(pad)
-        if not self._near(world_from_camera):
-            return self._membrane.rest
-        return self._membrane.pressed(self._scene.depth(self._camera, world_from_camera))
+        """Whether so many pixels of a pad are dented, as the robot filters them, that it stops."""
+        contact, rest = ContactRig(), self._membrane.rest
+        dents = [ndimage.uniform_filter(rest - depth, contact.filter) for depth in depths.values()]
+        return any((dent > contact.threshold).sum() >= contact.pixels for dent in dents)
 
     def _near(self, world_from_camera: FloatArray) -> bool:
         """Whether the object comes within _SPACING of a membrane."""

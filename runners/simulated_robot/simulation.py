@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -13,28 +15,50 @@ import trimesh
 from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.streams import Purpose, StreamKey, normals
+from chsel.sensing.depth_camera import PinholeCamera
 from replay.files import whole_file
 from runners.sessions.configurations import Configuration
-from runners.simulated_robot import wrist
-from runners.simulated_robot.cabinet import REST, stood_on_shelf
+from runners.simulated_robot import log_writer
+from runners.simulated_robot.cabinet import (
+    PADS,
+    REST,
+    stood_on_shelf,
+    world_from_camera,
+    world_from_wrist,
+    wrist_from_bubble_camera,
+)
 from runners.simulated_robot.log_writer import LogWriter
+from runners.simulated_robot.noise import bubble_depth, stereo_depth
 from runners.simulated_robot.pads import Pads
 from runners.simulated_robot.physics_scene import PhysicsScene
-from runners.simulated_robot.recorder import TICK, Recorder
 from runners.simulated_robot.settings import RobotSettings
 
+WORLD = "world"
+WRIST = "wrist"
+CAMERA = "camera_depth_optical_frame"
+JOINTS = ("wrist_x", "wrist_y", "wrist_z")
+TICK = 20_000_000  # ns: transforms are sent at every one
+START = 1_700_000_000_000_000_000  # ns: when every log begins
+
 HOME = (0.48, 0.0, 0.433)  # m: where the wrist is before and after all probes
+PUSH_STEP = 0.05  # m
+PUSH_SPEED, MOVE_SPEED = 0.05, 0.15  # m/s
+SPREAD = 0.003  # m: standard deviation of the wrist's place in a probe
 REACTION = 1  # ticks that the robot still moves on when its pads have felt something
 PAUSE = 5  # ticks between the steps of a push
-_SECONDS = TICK / 1e9
+
+# How long messages take to the log, seconds: at least, and that much more on average.
+_QUICK = (0.0005, 0.001)
+_SLOW = (0.020, 0.008)
+_SECOND = 1_000_000_000  # ns
+_SECONDS = TICK / 1e9  # of a tick
 
 
 @dataclass(frozen=True)
 class Push:
     """A probe as it really was. y, z: of the wrist, metres. reach: metres that it went.
 
-    stopped: by the "pads", the rigid "hand", or the "end" of its way. pressed: pixels of each pad
-    beyond the threshold then.
+    stopped: by the "pads", the rigid "hand", or the "end" of its way.
     """
 
     step: int
@@ -42,7 +66,6 @@ class Push:
     z: float
     reach: float
     stopped: str
-    pressed: dict[str, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +74,6 @@ class SimulatedLog:
 
     world_from_object: FloatArray
     pushes: tuple[Push, ...]
-    seconds: float
-    messages: int
 
 
 def simulate_log(
@@ -61,111 +82,160 @@ def simulate_log(
     mesh: trimesh.Trimesh,
     seed: int,
     settings: RobotSettings,
-    on_push: Callable[[Push], None] | None = None,
+    on_push: Callable[[Push], None] = lambda push: None,
 ) -> SimulatedLog:
     """Probe an object in the cabinet, and write the raw log; an older file of that name is gone.
 
     mesh: in its own frame, metres, of real size. The same arguments give the same bytes. Raises
     SessionError if the object does not fit the cabinet, or where PyBullet is not installed.
     """
-    grid = configuration.grid[: probe_count(configuration, settings)]
+    most = len(configuration.grid)
+    if settings.probes is not None and settings.probes > most:
+        raise SettingError(f"probes is {settings.probes}; accepted: 1 to {most}, or null for all")
     world_from_object = stood_on_shelf(mesh, configuration)
     pushes = []
     with (
         closing(PhysicsScene(mesh, world_from_object)) as scene,
-        whole_file(path) as beside,
+        whole_file(path, "a file in a folder that can be written") as beside,
         LogWriter(beside) as log,
     ):
         pads = Pads(scene, settings.bubbles.pinhole, mesh, world_from_object)
-        robot = _Robot(scene, pads, Recorder(log, scene, pads, settings, seed), settings)
+        robot = _Robot(log, scene, pads, settings, seed)
         robot.stand(settings.standing)
-        for step, offset in enumerate(grid):
-            pushes.append(robot.probe(step, offset, StreamKey(seed, step)))
-            if on_push is not None:
-                on_push(pushes[-1])
-        robot.move(np.array(HOME), settings.move_speed)
+        for step, offset in enumerate(configuration.grid[: settings.probes]):
+            pushes.append(robot.probe(step, offset))
+            on_push(pushes[-1])
+        robot.move(np.array(HOME))
         robot.stand(settings.dwell)
-    return SimulatedLog(world_from_object, tuple(pushes), robot.seconds, log.messages)
-
-
-def probe_count(configuration: Configuration, settings: RobotSettings) -> int:
-    """How many probes there will be; SettingError for more than the configuration has."""
-    most = len(configuration.grid)
-    if settings.probes is not None and settings.probes > most:
-        raise SettingError(f"probes is {settings.probes}; accepted: 1 to {most}, or null for all")
-    return settings.probes or most
+    return SimulatedLog(world_from_object, tuple(pushes))
 
 
 class _Robot:
-    """Moves the wrist on straight lines, tick by tick."""
+    """Moves the wrist on straight lines, and sends at every tick of its clock what is due."""
 
     def __init__(
-        self, scene: PhysicsScene, pads: Pads, recorder: Recorder, settings: RobotSettings
+        self, log: LogWriter, scene: PhysicsScene, pads: Pads, settings: RobotSettings, seed: int
     ) -> None:
-        self._scene = scene
-        self._pads = pads
-        self._recorder = recorder
-        self._settings = settings
-        self._position = np.array(HOME)
-        self._began = recorder.now
-
-    @property
-    def seconds(self) -> float:
-        return (self._recorder.now - self._began) / 1e9
+        self._log, self._scene, self._pads = log, scene, pads
+        self._settings, self._seed = settings, seed
+        self._ticks = 0
+        self._place(np.array(HOME))
+        self._world_from_camera = world_from_camera()
+        self._enter(0)
+        fixed = [(WORLD, CAMERA, self._world_from_camera)]
+        fixed += [(WRIST, f"bubble_{pad}_camera", wrist_from_bubble_camera(pad)) for pad in PADS]
+        sent = [log_writer.transform(*parts, self._now) for parts in fixed]
+        self._send("/tf_static", "tf2_msgs/TFMessage", {"transforms": sent})
 
     def stand(self, seconds: float) -> None:
         """Wait, with all sensors on."""
         for _ in range(round(seconds / _SECONDS)):
-            self._recorder.tick(self._position)
+            self._arrive(self._position)
 
-    def move(self, target: FloatArray, speed: float) -> None:
+    def move(self, target: FloatArray) -> None:
         """Go to target (3,), whatever is in the way."""
-        for position in _line(self._position, target, speed):
+        for position in _line(self._position, target, MOVE_SPEED):
             self._arrive(position)
 
-    def probe(self, step: int, offset: tuple[float, float], key: StreamKey) -> Push:
+    def probe(self, step: int, offset: tuple[float, float]) -> Push:
         """Go before the object, push until something stops it, and come back."""
-        settings, recorder = self._settings, self._recorder
-        recorder.enter(step)
-        spread = settings.spread * np.clip(normals(key.stream(Purpose.CONTROL_NOISE), 2), -3, 3)
-        start = np.array(REST) + np.array([0.0, *(np.array(offset) + spread)])
-        self.move(start, settings.move_speed)
-        recorder.mark(f"begin {step}")
+        self._enter(step)
+        drawn = normals(self._key.stream(Purpose.CONTROL_NOISE), 2)
+        start = np.array(REST)
+        start[1:] += np.array(offset) + SPREAD * np.clip(drawn, -3, 3)
+        self.move(start)
+        self._send("/probe", "std_msgs/String", {"data": f"begin {step}"})
         stopped = self._push()
-        self.stand(settings.dwell)
-        recorder.mark(f"end {step}")
+        self.stand(self._settings.dwell)
+        self._send("/probe", "std_msgs/String", {"data": f"end {step}"})
         reach = float(self._position[0] - start[0])
-        pressed = self._pads.pressed(recorder.depths(self._position))
-        self.move(start, settings.move_speed)
-        return Push(step, float(start[1]), float(start[2]), reach, stopped, pressed)
+        self.move(start)
+        return Push(step, float(start[1]), float(start[2]), reach, stopped)
 
     def _push(self) -> str:
         """Step forward until the hand is stopped; by what."""
-        ahead = np.array([self._settings.push_step, 0.0, 0.0])
+        ahead = np.array([PUSH_STEP, 0.0, 0.0])
         for _ in range(self._settings.push_steps):
-            way = _line(self._position, self._position + ahead, self._settings.push_speed)
+            way = _line(self._position, self._position + ahead, PUSH_SPEED)
             for position in way:
                 self._arrive(position)
-                stopped = self._stopped()
-                if stopped == "hand":
-                    return stopped
-                if stopped:
+                if self._scene.clearance(self._pose) <= 0.0:
+                    return "hand"
+                if self._pads.touches(self._depths):
                     for _, position in zip(range(REACTION), way, strict=False):
                         self._arrive(position)
-                    return stopped
+                    return "pads"
             for _ in range(PAUSE):
-                self._recorder.tick(self._position)
+                self._arrive(self._position)
         return "end"
 
-    def _stopped(self) -> str:
-        if self._scene.clearance(wrist.world_from_wrist(self._position)) <= 0.0:
-            return "hand"
-        depths = self._recorder.depths(self._position)
-        return "pads" if self._pads.touches(depths) else ""
+    @property
+    def _now(self) -> int:
+        """The simulated time, nanoseconds."""
+        return START + self._ticks * TICK
+
+    def _enter(self, probe: int) -> None:
+        """From here on all noise is that of a probe."""
+        self._key = StreamKey(self._seed, probe)
+        self._latency = self._key.stream(Purpose.SENSOR_NOISE, 0)
+        self._images = 0
+
+    def _place(self, position: FloatArray) -> None:
+        """Put the wrist at position (3,), where the bubbles' cameras see depths without noise."""
+        self._position, self._pose = position, world_from_wrist(position)
+        self._depths = self._pads.depths(self._pose)
 
     def _arrive(self, position: FloatArray) -> None:
-        self._position = position
-        self._recorder.tick(position)
+        """Send what is due with the wrist at position (3,), and let the clock go on."""
+        if not np.array_equal(position, self._position):
+            self._place(position)
+        now = self._now
+        moved = log_writer.transform(WORLD, WRIST, self._pose, now)
+        self._send("/tf", "tf2_msgs/TFMessage", {"transforms": [moved]})
+        joints = log_writer.joint_state(JOINTS, position.tolist(), now)
+        self._send("/joint_states", "sensor_msgs/JointState", joints)
+        bubbles, camera = self._settings.bubbles, self._settings.camera
+        if self._due(bubbles.rate):
+            for pad, depth in self._depths.items():
+                topic, frame = f"/bubble_{pad}/depth", f"bubble_{pad}_camera"
+                self._send_image(topic, frame, bubbles.pinhole, partial(bubble_depth, depth))
+        if self._due(camera.rate):
+            depth = self._scene.depth(camera.pinhole, self._world_from_camera, self._pose)
+            measure = partial(stereo_depth, depth, camera.pinhole)
+            self._send_image("/camera/depth", CAMERA, camera.pinhole, measure)
+        self._ticks += 1
+        self._log.flush(now)
+
+    def _due(self, rate: float) -> bool:
+        per_tick = rate * TICK / _SECOND
+        return self._ticks == 0 or int(self._ticks * per_tick) > int((self._ticks - 1) * per_tick)
+
+    def _send_image(
+        self,
+        topic: str,
+        frame: str,
+        camera: PinholeCamera,
+        measure: Callable[[np.random.Generator], np.ndarray],
+    ) -> None:
+        """An image, unless it is lost on its way. measure: makes it with the noise of a stream."""
+        self._images += 1
+        stream = self._key.stream(Purpose.SENSOR_NOISE, self._images)
+        if stream.random() >= self._settings.drop:
+            sent = log_writer.image(frame, measure(stream), self._now)
+            info = log_writer.camera_info(frame, camera, self._now)
+            self._send(f"{topic}/image_raw", "sensor_msgs/Image", sent, _SLOW)
+            self._send(f"{topic}/camera_info", "sensor_msgs/CameraInfo", info)
+
+    def _send(
+        self,
+        topic: str,
+        kind: str,
+        message: Mapping[str, Any],
+        latency: tuple[float, float] = _QUICK,
+    ) -> None:
+        least, more = latency
+        taken = least + 2.0 * more * self._latency.random()
+        self._log.add(topic, kind, message, self._now, self._now + round(taken * _SECOND))
 
 
 def _line(start: FloatArray, end: FloatArray, speed: float) -> Iterator[FloatArray]:

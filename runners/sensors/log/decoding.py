@@ -14,7 +14,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
 from chsel.sensing.depth_camera import PinholeCamera
 from replay.mcap.texts import one_line
-from runners.sensors.log.images import compressed_pixels, pixel_rows, png_pixels
+from runners.sensors.log.images import compressed_pixels, pixel_rows
 from runners.sensors.log.messages import (
     CameraInfoMessage,
     CloudMessage,
@@ -22,9 +22,7 @@ from runners.sensors.log.messages import (
     Decode,
     Decoded,
     ImageMessage,
-    JointsMessage,
-    MarkerMessage,
-    PoseMessage,
+    Joints,
     TransformMessage,
     UnusableMessage,
     WrenchMessage,
@@ -34,11 +32,11 @@ from runners.sensors.log.ros2_definitions import DEFINITIONS, full_definition
 _NANOSECONDS = 10**9
 _END_OF_TIME = 2**63
 _FURTHEST = 1e9  # metres: no robot works further from the origin of its frame
-_LARGEST_FORCE = 1e6  # N, Nm
 _FLOATS = {7: "f4", 8: "f8"}  # in sensor_msgs/PointField and foxglove.PackedElementField alike
 _AXES = ("x", "y", "z")
 
-Header = tuple[int, int, str]  # seconds, nanoseconds, frame
+Read = Callable[[Any, str], Content]
+"""From a parsed message and its frame to its content."""
 
 
 def decoder(name: str, encoding: str, definition: str | None = None) -> Decode:
@@ -47,17 +45,14 @@ def decoder(name: str, encoding: str, definition: str | None = None) -> Decode:
     definition: of a ROS 2 message in the file, by which it is decoded; by default that of ROS 2.
     """
     try:
-        parse, header, content = _reader(name, encoding, definition)
+        parse, read = _reader(name, encoding, definition)
     except UnusableMessage as error:
         unread: list[Decoded] = [(None, error)]
         return lambda data: iter(unread)
 
     def decoded(message: Any) -> Decoded:
-        seconds, nanoseconds, frame = header(message)
-        stamp = seconds * _NANOSECONDS + nanoseconds
-        if not 0 <= stamp < _END_OF_TIME:
-            raise UnusableMessage("its time stamp is no time")
-        return stamp or None, content(message, _frame_name(frame))
+        stamp, frame = _header(message)
+        return stamp, read(message, frame)
 
     def decode(data: bytes) -> Iterator[Decoded]:
         message = _checked(name, parse, data)
@@ -84,11 +79,11 @@ def _checked(name: str, read: Callable[[Any], Any], given: Any) -> Any:
 
 def _reader(
     name: str, encoding: str, definition: str | None
-) -> tuple[Callable[[bytes], Any], Callable[[Any], Header], Callable[[Any, str], Content]]:
-    """What parses messages of a schema, and reads their header and their content."""
-    if encoding == "cdr" and (short := name.replace("/msg/", "/")) in _ROS2:
-        header = _no_header if _ROS2[short] is _ros2_marker else _ros2_header
-        return _ros2_parser(short, definition), header, _ROS2[short]
+) -> tuple[Callable[[bytes], Any], Read]:
+    """What parses messages of a schema, and what reads their content."""
+    short = name.replace("/msg/", "/")
+    if encoding == "cdr" and short in _ROS2:
+        return _ros2_parser(short, definition), _ROS2[short]
     if encoding == "protobuf" and name in _FOXGLOVE:
         short = name.removeprefix("foxglove.")
         # The installed package's class, whatever the file describes.
@@ -96,7 +91,7 @@ def _reader(
             kind = getattr(import_module(f"foxglove_schemas_protobuf.{short}_pb2"), short)
         except ImportError:
             raise UnusableMessage(f"foxglove-schemas-protobuf lacks {name}: update it") from None
-        return kind.FromString, _foxglove_header, _FOXGLOVE[name]
+        return kind.FromString, _FOXGLOVE[name]
     raise UnusableMessage(f"messages {name} as {encoding or 'unknown bytes'} are not read")
 
 
@@ -113,20 +108,18 @@ def _ros2_parser(name: str, definition: str | None) -> Callable[[bytes], Any]:
     return parse
 
 
-def _no_header(message: Any) -> Header:
-    return 0, 0, ""
-
-
-def _ros2_header(message: Any) -> Header:
-    header = message.header
-    return header.stamp.sec, header.stamp.nanosec, header.frame_id
-
-
-def _foxglove_header(message: Any) -> Header:
-    if not hasattr(message, "timestamp"):
-        return _no_header(message)
-    time = message.timestamp
-    return time.seconds, time.nanos, getattr(message, "frame_id", "")
+def _header(message: Any) -> tuple[int | None, str]:
+    """The time stamp, nanoseconds, None where there is none, and the frame of a message."""
+    if hasattr(message, "header"):  # of ROS 2
+        time, frame = message.header.stamp, message.header.frame_id
+        stamp = time.sec * _NANOSECONDS + time.nanosec
+    elif hasattr(message, "timestamp"):  # of Foxglove
+        stamp, frame = message.timestamp.ToNanoseconds(), getattr(message, "frame_id", "")
+    else:
+        return None, ""
+    if stamp not in range(_END_OF_TIME):
+        raise UnusableMessage("its time stamp is no time")
+    return stamp or None, _frame_name(frame)
 
 
 def _frame_name(name: str) -> str:
@@ -134,31 +127,22 @@ def _frame_name(name: str) -> str:
     return one_line(name.removeprefix("/"))
 
 
-def _ros2_image(message: Any, frame: str) -> ImageMessage:
+def _image(message: Any, frame: str) -> ImageMessage:
     values = pixel_rows(
         message.data,
         message.encoding,
         (message.width, message.height),
         message.step,
-        big_endian=message.is_bigendian != 0,
+        big_endian=bool(getattr(message, "is_bigendian", 0)),
     )
     return ImageMessage(frame, values)
 
 
-def _foxglove_image(message: Any, frame: str) -> ImageMessage:
-    size = (message.width, message.height)
-    return ImageMessage(frame, pixel_rows(message.data, message.encoding, size, message.step))
-
-
-def _ros2_compressed_image(message: Any, frame: str) -> ImageMessage:
+def _compressed_image(message: Any, frame: str) -> ImageMessage:
     return ImageMessage(frame, compressed_pixels(message.data, message.format))
 
 
-def _foxglove_compressed_image(message: Any, frame: str) -> ImageMessage:
-    return ImageMessage(frame, png_pixels(message.data))
-
-
-def _ros2_camera(message: Any, frame: str) -> CameraInfoMessage:
+def _ros2_camera(message: Any, _: str) -> CameraInfoMessage:
     """Of the pixels that are sent: a region of the sensor, and several of its pixels as one."""
     region, across, down = message.roi, max(message.binning_x, 1), max(message.binning_y, 1)
     fx, _, cx, _, fy, cy, *_ = message.k
@@ -170,13 +154,13 @@ def _ros2_camera(message: Any, frame: str) -> CameraInfoMessage:
         (cx - region.x_offset) / across,
         (cy - region.y_offset) / down,
     )
-    return CameraInfoMessage(frame, camera, distorted=any(message.d))
+    return CameraInfoMessage(camera, distorted=any(message.d))
 
 
-def _foxglove_camera(message: Any, frame: str) -> CameraInfoMessage:
+def _foxglove_camera(message: Any, _: str) -> CameraInfoMessage:
     fx, _, cx, _, fy, cy, *_ = message.K
     camera = PinholeCamera(message.width, message.height, fx, fy, cx, cy)
-    return CameraInfoMessage(frame, camera, distorted=any(message.D))
+    return CameraInfoMessage(camera, distorted=any(message.D))
 
 
 def _ros2_cloud(message: Any, frame: str) -> CloudMessage:
@@ -194,34 +178,24 @@ def _ros2_cloud(message: Any, frame: str) -> CloudMessage:
 def _foxglove_cloud(message: Any, frame: str) -> CloudMessage:
     named = {field.name: (field.offset, field.type) for field in message.fields}
     stride, data = message.point_stride, message.data
-    if stride < 1 or len(data) % stride:
-        raise UnusableMessage(f"a point cloud has {len(data)} bytes, of {stride} a point")
-    size = (len(data) // stride, 1)
-    points = packed_points(data, named, stride, size=size, row=len(data))
+    count = len(data) // stride
+    points = packed_points(data, named, stride, size=(count, 1), row=count * stride)
     if message.HasField("pose"):
         points = apply(rigid(message.pose.position, message.pose.orientation), points)
     return CloudMessage(frame, points)
 
 
-def _ros2_transform(message: Any, frame: str) -> TransformMessage:
-    moved = message.transform
-    return _transform(frame, message.child_frame_id, moved.translation, moved.rotation)
-
-
-def _foxglove_transform(message: Any, _: str) -> TransformMessage:
-    parent, child = message.parent_frame_id, message.child_frame_id
-    return _transform(_frame_name(parent), child, message.translation, message.rotation)
-
-
-def _transform(parent: str, child: str, position: Any, quaternion: Any) -> TransformMessage:
-    child = _frame_name(child)
+def _transform(message: Any, frame: str) -> TransformMessage:
+    moved = getattr(message, "transform", message)  # of Foxglove's, it is the message itself
+    parent = _frame_name(getattr(message, "parent_frame_id", frame))
+    child = _frame_name(message.child_frame_id)
     if not parent or not child:
         raise UnusableMessage("a transform lacks the name of a frame")
-    return TransformMessage(parent, child, rigid(position, quaternion))
+    return TransformMessage(parent, child, rigid(moved.translation, moved.rotation))
 
 
-def _pose(message: Any, frame: str) -> PoseMessage:
-    return PoseMessage(frame, rigid(message.pose.position, message.pose.orientation))
+def _pose(message: Any, frame: str) -> TransformMessage:
+    return TransformMessage(frame, "", rigid(message.pose.position, message.pose.orientation))
 
 
 def _poses(message: Any, frame: str) -> CloudMessage:
@@ -234,52 +208,47 @@ def _point(message: Any, frame: str) -> CloudMessage:
 
 def _wrench(message: Any, frame: str) -> WrenchMessage:
     force, torque = _positions([message.wrench.force, message.wrench.torque])
-    if not (np.abs([force, torque]) <= _LARGEST_FORCE).all():  # NaN is not
-        raise UnusableMessage(f"a force or torque is not finite, or above {_LARGEST_FORCE:g}")
+    if not np.isfinite([force, torque]).all():
+        raise UnusableMessage("a force or torque is not finite")
     return WrenchMessage(frame, force, torque)
 
 
-def _ros2_joints(message: Any, _: str) -> JointsMessage:
-    return _joints(zip(message.name, message.position, strict=True))
-
-
-def _foxglove_joints(message: Any, _: str) -> JointsMessage:
-    known = [joint for joint in message.joints if joint.HasField("position")]
-    return _joints((joint.name, joint.position) for joint in known)
-
-
-def _joints(positions: Iterable[tuple[str, float]]) -> JointsMessage:
+def _joints(message: Any, _: str) -> Joints:
+    if hasattr(message, "joints"):  # of Foxglove
+        known = [joint for joint in message.joints if joint.HasField("position")]
+        positions = [(joint.name, joint.position) for joint in known]
+    else:
+        positions = list(zip(message.name, message.position, strict=True))
     found = {one_line(name): float(position) for name, position in positions}
     for name, position in found.items():
         if not math.isfinite(position):
             raise UnusableMessage(f"joint {name} is at {position}")
-    return JointsMessage(found)
+    return found
 
 
-def _ros2_marker(message: Any, _: str) -> MarkerMessage:
-    value = message.data
-    return MarkerMessage(one_line(str(value).lower() if isinstance(value, bool) else str(value)))
+def _ros2_marker(message: Any, _: str) -> str:
+    return one_line(str(message.data))
 
 
-def _log(message: Any, _: str) -> MarkerMessage:
-    return MarkerMessage(one_line(message.message))
+def _log(message: Any, _: str) -> str:
+    return one_line(message.message)
 
 
-def _pair(message: Any, _: str) -> MarkerMessage:
+def _pair(message: Any, _: str) -> str:
     """A key "begin" with value "3" is the text "begin 3"."""
-    return MarkerMessage(one_line(f"{message.key} {message.value}"))
+    return one_line(f"{message.key} {message.value}")
 
 
 def rigid(position: Any, quaternion: Any) -> FloatArray:
     """The transform (4, 4) of a position x, y, z, metres, and a quaternion of any length."""
-    numbers = x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
+    numbers = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     place = position.x, position.y, position.z
     largest = max(map(abs, numbers))
     if not largest > 0.0 or not all(map(math.isfinite, numbers)):
-        raise UnusableMessage(f"its quaternion is {_shown(numbers)}")
+        raise UnusableMessage("its quaternion is 0 or not finite")
     if not all(abs(value) < _FURTHEST for value in place):
-        raise UnusableMessage(f"its position is {_shown(place)}")
-    x, y, z, w = x / largest, y / largest, z / largest, w / largest
+        raise UnusableMessage(f"its position is not finite, or beyond {_FURTHEST:g} m")
+    x, y, z, w = (value / largest for value in numbers)
     s = 2.0 / (x * x + y * y + z * z + w * w)
     return np.array(
         [
@@ -289,10 +258,6 @@ def rigid(position: Any, quaternion: Any) -> FloatArray:
             [0.0, 0.0, 0.0, 1.0],
         ]
     )
-
-
-def _shown(numbers: tuple[float, ...]) -> str:
-    return ", ".join(f"{number:.3g}" for number in numbers)
 
 
 def _positions(points: Iterable[Any]) -> FloatArray:
@@ -337,14 +302,14 @@ def packed_points(
     return np.stack([points[axis].astype(np.float64) for axis in _AXES], axis=1)
 
 
-_ROS2: dict[str, Callable[[Any, str], Content]] = {
-    "sensor_msgs/Image": _ros2_image,
-    "sensor_msgs/CompressedImage": _ros2_compressed_image,
+_ROS2: dict[str, Read] = {
+    "sensor_msgs/Image": _image,
+    "sensor_msgs/CompressedImage": _compressed_image,
     "sensor_msgs/CameraInfo": _ros2_camera,
     "sensor_msgs/PointCloud2": _ros2_cloud,
-    "sensor_msgs/JointState": _ros2_joints,
-    "tf2_msgs/TFMessage": _ros2_transform,
-    "geometry_msgs/TransformStamped": _ros2_transform,
+    "sensor_msgs/JointState": _joints,
+    "tf2_msgs/TFMessage": _transform,
+    "geometry_msgs/TransformStamped": _transform,
     "geometry_msgs/PoseStamped": _pose,
     "geometry_msgs/PoseArray": _poses,
     "geometry_msgs/PointStamped": _point,
@@ -355,17 +320,17 @@ _ROS2: dict[str, Callable[[Any, str], Content]] = {
         if name.startswith("std_msgs/") and name != "std_msgs/Header"
     },
 }
-_FOXGLOVE: dict[str, Callable[[Any, str], Content]] = {
-    "foxglove.RawImage": _foxglove_image,
-    "foxglove.CompressedImage": _foxglove_compressed_image,
+_FOXGLOVE: dict[str, Read] = {
+    "foxglove.RawImage": _image,
+    "foxglove.CompressedImage": _compressed_image,
     "foxglove.CameraCalibration": _foxglove_camera,
-    "foxglove.FrameTransform": _foxglove_transform,
-    "foxglove.FrameTransforms": _foxglove_transform,
+    "foxglove.FrameTransform": _transform,
+    "foxglove.FrameTransforms": _transform,
     "foxglove.PoseInFrame": _pose,
     "foxglove.PosesInFrame": _poses,
     "foxglove.Point3InFrame": _point,
     "foxglove.PointCloud": _foxglove_cloud,
-    "foxglove.JointStates": _foxglove_joints,
+    "foxglove.JointStates": _joints,
     "foxglove.Log": _log,
     "foxglove.KeyValuePair": _pair,
 }

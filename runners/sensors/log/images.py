@@ -13,7 +13,6 @@ from chsel.errors import SessionError
 from runners.sensors.log.messages import UnusableMessage
 
 _KINDS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-_PNG = b"\x89PNG\r\n\x1a\n"
 _COMPRESSED_DEPTH = struct.Struct("<iff")  # format, and the quantisation's two numbers
 _FORMATS = {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF"}
 
@@ -36,46 +35,39 @@ def pixel_rows(
     return np.ascontiguousarray(rows).view(kind).astype(kind.newbyteorder("="), copy=False)
 
 
-def png_pixels(data: bytes) -> np.ndarray:
-    """Values (H, W), uint16, of a grey PNG of 16 bits."""
-    if not data.startswith(_PNG):
-        kind = "JPEG, which is lossy, is" if data.startswith(b"\xff\xd8") else "this is"
-        raise UnusableMessage(f"{kind} no depth; accepted: PNG")
-    try:
-        with Image.open(BytesIO(data), formats=("PNG",)) as image:
-            if not image.mode.startswith("I"):
-                raise UnusableMessage(f"a PNG of mode {image.mode} is no depth; accepted: 16 bit")
-            return np.asarray(image).astype(np.uint16, copy=False)
-    except UnusableMessage:
-        raise
-    except Exception as error:  # Pillow raises whatever it stumbles over
-        raise UnusableMessage(f"a PNG is broken: {type(error).__name__}") from None
-
-
 def compressed_pixels(data: bytes, image_format: str) -> np.ndarray:
-    """Values (H, W) of an image of sensor_msgs/CompressedImage: uint16, or float32, metres.
+    """Values (H, W) of a PNG, as sensor_msgs/CompressedImage has it: uint16, or float32, metres.
 
     Formats of "compressedDepth" begin with 12 bytes; theirs of floating point hold the inverse
     depth as whole numbers n > 0, depth = a / (n - b), and 0 where there is none.
     """
     encoding, _, transport = image_format.partition(";")
     if "compressedDepth" not in transport:
-        return png_pixels(data)
+        return _png_pixels(data)
     if "rvl" in transport.lower():
         raise UnusableMessage("compressedDepth by RVL is not read; accepted: PNG")
-    if len(data) < _COMPRESSED_DEPTH.size:
-        raise UnusableMessage("an image of compressedDepth ends within its head")
-    _, scale, offset = _COMPRESSED_DEPTH.unpack_from(data)
-    pixels = png_pixels(data[_COMPRESSED_DEPTH.size :])
+    pixels = _png_pixels(data[_COMPRESSED_DEPTH.size :])
     if encoding.strip() != "32FC1":
         return pixels
-    if not (np.isfinite(scale) and np.isfinite(offset) and scale > 0.0):
-        raise UnusableMessage(f"the quantisation of a depth image is {scale:.3g}, {offset:.3g}")
+    _, scale, offset = _COMPRESSED_DEPTH.unpack_from(data)
     with np.errstate(all="ignore"):
         depth = scale / (pixels.astype(np.float64) - offset)
         depth = depth.astype(np.float32)
     depth[(pixels == 0) | ~(depth > 0.0)] = np.nan
     return depth
+
+
+def _png_pixels(data: bytes) -> np.ndarray:
+    """Values (H, W), uint16, of a grey PNG of 16 bits."""
+    try:
+        image = Image.open(BytesIO(data), formats=("PNG",))
+        values = np.asarray(image)
+    except Exception as error:  # Pillow raises whatever it stumbles over
+        kind = "a JPEG, which is lossy" if data.startswith(b"\xff\xd8") else type(error).__name__
+        raise UnusableMessage(f"an image is no PNG ({kind}); accepted: PNG of 16 bits") from None
+    if not image.mode.startswith("I"):
+        raise UnusableMessage(f"a PNG of mode {image.mode} is no depth; accepted: 16 bits")
+    return values.astype(np.uint16, copy=False)
 
 
 def read_image(path: Path, where: str) -> np.ndarray:
@@ -85,19 +77,17 @@ def read_image(path: Path, where: str) -> np.ndarray:
     a file that is missing, broken, or of several channels.
     """
     kind = path.suffix.lower()
-    if kind not in (".npy", *_FORMATS):
-        raise SessionError(f"{where} {path}: of no known kind; accepted: .png, .tiff, .npy")
-    if not path.is_file():
-        raise SessionError(f"{where} {path}: no such file; accepted: a .png, .tiff or .npy file")
     try:
         if kind == ".npy":
             values = np.load(path, allow_pickle=False)
-        else:
+        elif kind in _FORMATS:
             with Image.open(path, formats=(_FORMATS[kind],)) as image:
                 values = np.asarray(image)
+        else:
+            raise SessionError("of no known kind")
     except Exception as error:  # numpy and Pillow raise whatever they stumble over
         reason = " ".join(str(error).split())[:120]
-        raise SessionError(f"{where} {path}: broken ({reason}); accepted: {kind}") from None
+        raise SessionError(f"{where} {path}: {reason}; accepted: .png, .tiff, .npy") from None
     if values.ndim != 2 or values.dtype.kind not in "buif":
         raise SessionError(
             f"{where} {path}: {values.dtype} of shape {values.shape}; accepted: numbers, (height, "

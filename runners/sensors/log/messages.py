@@ -32,34 +32,21 @@ class ImageMessage:
 class CameraInfoMessage:
     """Intrinsics of a camera. distorted: whether lens distortion was left in its images."""
 
-    frame: str
     camera: PinholeCamera
     distorted: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class TransformMessage:
-    """Pose (4, 4) of a child frame in its parent's; static ones hold for all times."""
+    """Pose (4, 4) of a child frame in its parent's; static ones hold for all times.
+
+    child: "" of a message of a pose alone, such as geometry_msgs/PoseStamped.
+    """
 
     parent: str
     child: str
     parent_from_child: FloatArray
     static: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class PoseMessage:
-    """Pose (4, 4) of a body in a frame."""
-
-    frame: str
-    frame_from_body: FloatArray
-
-
-@dataclass(frozen=True)
-class JointsMessage:
-    """Positions of joints by name, radians or metres."""
-
-    positions: dict[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,22 +66,17 @@ class WrenchMessage:
     torque: FloatArray  # (3,), newton metres
 
 
-@dataclass(frozen=True)
-class MarkerMessage:
-    """A text such as "begin 3" or "end", a number, or true and false, as text."""
-
-    text: str
-
+Joints = dict[str, float]
+"""Positions of joints by name, radians or metres."""
 
 Content = (
     ImageMessage
     | CameraInfoMessage
     | TransformMessage
-    | PoseMessage
-    | JointsMessage
     | CloudMessage
     | WrenchMessage
-    | MarkerMessage
+    | Joints
+    | str  # of a marker: "begin 3" or "end", a number, "true" or "false"
 )
 Decoded = tuple[int | None, Content | UnusableMessage]
 """The sender's time, nanoseconds, where there is one, and one content of a message."""

@@ -6,16 +6,15 @@ import itertools
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from chsel.errors import SettingError
 from runners.sensors.rig import ProbeTimes
 from runners.sensors.session_report import LogWarnings
 
 _TEXT = re.compile(r"(begin|end)\s*(\d{1,6})?")
-_INTEGER = re.compile(r"\s*(-?\d{1,6})\s*")
+_STATE = re.compile(r"true|false|-?\d{1,6}")  # sent all the time: repeating it says nothing new
 _SECOND = 1_000_000_000  # ns
-_Span = tuple[int, int, int | None]
+_Span = tuple[int, int, int | None]  # begin, end, index of the probe, where it is given
 
 
 @dataclass(frozen=True)
@@ -42,36 +41,35 @@ def marked_windows(
 ) -> list[ProbeWindow]:
     """The probes of markers (time, text) in a log from `first` to `last`; there may be none.
 
-    Texts are "begin N", "begin", "end N", "end", integers (below 0: end) and true or false.
-    Other texts, and begins and ends that do not fit, are warnings.
+    Texts are "begin N", "begin", "end N", "end", integers (below 0: end) and true or false. A begin
+    ends the probe before it, unless it repeats its index. Other texts, and begins and ends that do
+    not fit, are warnings.
     """
     spans: list[_Span] = []
     begun: tuple[int, int | None] | None = None
     for time, text in sorted(markers, key=lambda marker: marker[0]):
-        marker = _parsed(text)
-        if marker is None:
-            warnings.warn(f"a marker is {text[:40]!r}; accepted: begin N, end")
-        elif begun is None:
-            if marker.begins:
-                begun = time, marker.probe
-            elif not marker.is_state:
-                warnings.warn(f"{_name(marker.probe)} has an end and no begin; ignored")
-        elif not marker.begins:
-            begin, index = begun
-            if None not in (marker.probe, index) and marker.probe != index:
-                warnings.warn(f"the end of probe {marker.probe} is taken as that of probe {index}")
-            spans.append((begin, time, index))
-            begun = None
-        elif marker.probe == begun[1] and (marker.is_state or marker.probe is not None):
-            if not marker.is_state:
-                warnings.warn(f"probe {marker.probe} begins twice without an end; taken as one")
+        text = text.strip().lower()
+        state, match = _STATE.fullmatch(text), _TEXT.fullmatch(text)
+        if state:
+            begins = text != "false" and not text.startswith("-")
+            index = int(text) if begins and text != "true" else None
+        elif match:
+            begins, index = match[1] == "begin", int(match[2]) if match[2] else None
         else:
-            if not marker.is_state:
-                warnings.warn(f"{_name(begun[1])} has a begin and no end; the next begin ends it")
+            warnings.warn(f"a marker is {text[:40]!r}; accepted: begin N, end")
+            continue
+        repeats = begins and begun is not None and index == begun[1]
+        if repeats and (state or index is not None):
+            continue
+        if begun is not None:
             spans.append((begun[0], time, begun[1]))
-            begun = time, marker.probe
+        if not state and begins == (begun is not None):
+            warnings.warn(
+                f"the marker {text!r} does not follow {'an end' if begins else 'a begin'}"
+            )
+        begun = (time, index) if begins else None
     if begun is not None:
-        warnings.warn(f"{_name(begun[1])} has a begin and no end; the log's end ends it")
+        warnings.warn("the last probe has a begin and no end; the log's end ends it")
         spans.append((begun[0], max(last, begun[0]), begun[1]))
     return _windows(spans, first, last, warnings)
 
@@ -104,45 +102,21 @@ def whole_log(first: int, last: int) -> list[ProbeWindow]:
     return [ProbeWindow(0, first, first, last, last + 1)]
 
 
-class _Marker(NamedTuple):
-    begins: bool
-    probe: int | None  # its index, where given
-    is_state: bool  # sent all the time, so that repeating it says nothing new
-
-
-def _parsed(text: str) -> _Marker | None:
-    """The marker of a text; None if it is none."""
-    lowered = text.strip().lower()
-    if lowered in ("true", "false"):
-        return _Marker(lowered == "true", None, True)
-    number = _INTEGER.fullmatch(text)
-    if number:
-        value = int(number.group(1))
-        return _Marker(value >= 0, value if value >= 0 else None, True)
-    match = _TEXT.fullmatch(lowered)
-    if match is None:
-        return None
-    return _Marker(match[1] == "begin", int(match[2]) if match[2] else None, False)
-
-
-def _name(index: int | None) -> str:
-    return "a probe" if index is None else f"probe {index}"
-
-
 def _windows(spans: list[_Span], first: int, last: int, warnings: LogWarnings) -> list[ProbeWindow]:
-    """Windows of spans (begin, end, index) in order of time; indices that do not rise are new."""
-    named = [index for _, _, index in spans if index is not None]
-    rising = all(a < b for a, b in itertools.pairwise(named))
+    """Windows of spans in order of time; indices that do not rise are counted anew."""
+    if not spans:
+        return []
     steps = list(range(len(spans)))
-    if named and rising and len(named) == len(spans):
+    named = [index for _, _, index in spans if index is not None]
+    if len(named) == len(spans) and all(a < b for a, b in itertools.pairwise(named)):
         steps = named
     elif named:
         warnings.warn(
             f"probes are marked {', '.join(map(str, named[:10]))}; as these do not rise, they are "
             f"counted from 0 to {len(spans) - 1}"
         )
-    opens = [min(first, spans[0][0]) if k == 0 else span[0] for k, span in enumerate(spans)]
-    closes = [*opens[1:], max(last, spans[-1][1]) + 1] if spans else []
+    opens = [min(first, spans[0][0]), *(begin for begin, _, _ in spans[1:])]
+    closes = [*opens[1:], max(last, spans[-1][1]) + 1]
     return [
         ProbeWindow(step, opened, begin, end, closed)
         for step, opened, (begin, end, _), closed in zip(steps, opens, spans, closes, strict=True)

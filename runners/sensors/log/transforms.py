@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from array import array
 from bisect import bisect_right
 from collections import Counter
@@ -12,19 +11,16 @@ import numpy as np
 
 from chsel.errors import SessionError
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
-from chsel.problem.poses import compose, inverse, rotation_matrices, slerp
+from chsel.problem.poses import compose, inverse, quaternions, rotation_matrices, slerp
 from runners.sensors.log.clocks import ClockCorrection
-from runners.sensors.log.messages import Received, TransformMessage
+from runners.sensors.log.messages import Joints, Received, TransformMessage
 
 _NANOSECONDS = 1e9
 _MOST_LISTED = 30
-_NUMBERS = 7  # of a pose: position, quaternion
-_SAME = 1e-6  # metres, and parts of a quaternion
+_SAME = 1e-6  # metres, and parts of a rotation matrix
 
 MOVED = 0.01  # rad or m: by which a joint must move to make another hand
 MOST_OF_A_PROBE = 50
-
-Joints = dict[str, float]
 
 
 class TransformError(SessionError):
@@ -57,19 +53,17 @@ class TransformTree:
                 self.faults[f"frame {child} is its own ancestor, by way of {parent}"] += 1
                 return
             edge = self._edges[child] = _Edge(parent)
-        elif edge.parent != parent:
+        if edge.parent != parent:
             self.faults[f"frame {child} has two parents, {edge.parent} and {parent}"] += 1
-            return
-        if not edge.add(received, message):
+        elif not edge.add(received, message):
             self.faults[f"frame {child} is static in several places"] += 1
 
     def settle(self, clocks: ClockCorrection) -> None:
         """All transforms were added; their times are those by the clocks."""
         for edge in self._edges.values():
             edge.settle(clocks)
-        nothing = np.zeros(0, dtype=np.int64)
         times = [edge.times for edge in self._edges.values()]
-        self.times = np.unique(np.concatenate([nothing, *times]))
+        self.times = np.unique(np.concatenate([self.times, *times]))
 
     def lookup(self, target: str, source: str, stamp_ns: int, *, gap_s: float) -> FloatArray:
         """target_from_source (4, 4) at a time, nanoseconds.
@@ -78,9 +72,18 @@ class TransformTree:
         seconds apart; before the first and after the last sample, by at most `gap_s`, as they are.
         Raises TransformError if a frame is unknown, not connected, or not known at that time.
         """
-        poses, valid = self.lookups(target, source, np.array([stamp_ns]), gap_s=gap_s)
+        stamps = np.array([stamp_ns])
+        poses, valid = self.lookups(target, source, stamps, gap_s=gap_s)
         if not valid[0]:
-            raise TransformError(self._missing(target, source, stamp_ns, gap_s))
+            down, up = self._path(target, source)
+            edges = [(child, self._edges[child]) for child in (*down, *up)]
+            child, edge = next(one for one in edges if not one[1].at(stamps, gap_s)[1][0])
+            away = edge.nearest(stamp_ns)
+            raise TransformError(
+                f"{target} from {source}: {child} in {edge.parent} is not known at "
+                f"{stamp_ns / _NANOSECONDS:.3f} s; the nearest is {abs(away):.3f} s "
+                f"{'before' if away < 0 else 'after'}, and gaps of up to {gap_s:g} s are bridged"
+            )
         pose: FloatArray = poses[0]
         return pose
 
@@ -124,7 +127,7 @@ class TransformTree:
         if from_target[-1] != from_source[-1]:
             trees = "; ".join(
                 f"{root}: {_listed([name for name in frames if self._ancestry(name)[-1] == root])}"
-                for root in dict.fromkeys((from_target[-1], from_source[-1]))
+                for root in (from_target[-1], from_source[-1])
             )
             raise TransformError(
                 f"frames {target} and {source} are not connected, but in two trees: {trees}"
@@ -135,21 +138,6 @@ class TransformTree:
             [name for name in from_source if name not in shared],
         )
 
-    def _missing(self, target: str, source: str, stamp_ns: int, gap_s: float) -> str:
-        """Which transform is not known at a time, and when it is."""
-        stamps = np.array([stamp_ns])
-        for child in [name for path in self._path(target, source) for name in path]:
-            edge = self._edges[child]
-            if not edge.at(stamps, gap_s)[1][0]:
-                away = edge.nearest(stamp_ns)
-                side = "before" if away < 0 else "after"
-                return (
-                    f"{target} from {source}: {child} in {edge.parent} is not known at "
-                    f"{stamp_ns / _NANOSECONDS:.3f} s; the nearest is {abs(away):.3f} s {side}, "
-                    f"and gaps of up to {gap_s:g} s are bridged"
-                )
-        return f"{target} from {source} is not known at {stamp_ns / _NANOSECONDS:.3f} s"
-
 
 class _Edge:
     """Poses of one frame in its parent's over time."""
@@ -157,25 +145,24 @@ class _Edge:
     def __init__(self, parent: str) -> None:
         self.parent = parent
         self.times: IntArray = np.zeros(0, dtype=np.int64)  # (N,), rising
-        self._numbers: FloatArray = np.zeros((0, _NUMBERS))
-        self._static: tuple[int, FloatArray] | None = None
+        self._positions: FloatArray = np.zeros((0, 3))
+        self._quaternions: FloatArray = np.zeros((0, 4))
+        self._static: tuple[int, FloatArray] | None = None  # stamp, pose
         self._added: dict[str, tuple[array[int], array[int], array[float]]] = {}
-        """The log's times, stamps and poses by topic."""
+        """The log's times, stamps and poses (4, 4) by topic."""
 
     def add(self, received: Received, message: TransformMessage) -> bool:
         """Whether the pose agrees with earlier ones; of static ones the latest holds."""
-        rows = message.parent_from_child.tolist()
-        numbers = (rows[0][3], rows[1][3], rows[2][3], *unit_quaternion(rows))
+        pose = message.parent_from_child
         if message.static:
-            pose, stamp = np.array(numbers), received.stamp or received.log_time
-            before, self._static = self._static, self._static or (stamp, pose)
-            if stamp >= self._static[0]:
-                self._static = (stamp, pose)
-            return before is None or _agree(before[1], pose)
+            stamp = received.stamp or received.log_time
+            before = self._static or (stamp, pose)
+            self._static = (stamp, pose) if stamp >= before[0] else before
+            return bool(np.abs(before[1] - pose).max() < _SAME)
         added = self._added.setdefault(received.topic, (array("q"), array("q"), array("d")))
         added[0].append(received.log_time)
         added[1].append(received.stamp or 0)
-        added[2].extend(numbers)
+        added[2].frombytes(pose.tobytes())
         return True
 
     def settle(self, clocks: ClockCorrection) -> None:
@@ -185,16 +172,16 @@ class _Edge:
         times = [clocks.times(topic, *some[:2]) for topic, some in self._added.items()]
         numbers = np.concatenate([np.frombuffer(some[2]) for some in self._added.values()])
         self.times, chosen = np.unique(np.concatenate(times), return_index=True)
-        self._numbers = numbers.reshape(-1, _NUMBERS)[chosen]
+        poses = numbers.reshape(-1, 4, 4)[chosen]
+        self._positions, self._quaternions = poses[:, :3, 3], quaternions(poses[:, :3, :3])
         self._added.clear()
 
     def at(self, stamps: IntArray, gap_s: float) -> tuple[FloatArray, BoolArray]:
         """Poses (N, 4, 4) at times (N,), and whether (N,) they are known."""
-        known_at, numbers = self.times, self._numbers
+        known_at = self.times
         if len(known_at) == 0:
             assert self._static is not None
-            poses = compose(rotation_matrices(self._static[1][None, 3:]), self._static[1][None, :3])
-            return np.repeat(poses, len(stamps), axis=0), np.ones(len(stamps), dtype=bool)
+            return np.repeat(self._static[1][None], len(stamps), axis=0), np.ones(len(stamps), bool)
         after = np.searchsorted(known_at, stamps)
         left = np.clip(after - 1, 0, len(known_at) - 1)
         right = np.clip(after, 0, len(known_at) - 1)
@@ -202,41 +189,16 @@ class _Edge:
         to_left = (stamps - known_at[left]) / _NANOSECONDS
         span = (known_at[right] - known_at[left]) / _NANOSECONDS
         near = np.where(left == right, np.abs(to_left) <= gap_s, span <= gap_s)
-        first, second = numbers[left], numbers[right]
         fraction = np.where(span > 0.0, np.clip(to_left / np.where(span > 0.0, span, 1.0), 0, 1), 0)
-        position = first[:, :3] + fraction[:, None] * (second[:, :3] - first[:, :3])
-        return compose(
-            rotation_matrices(slerp(first[:, 3:], second[:, 3:], fraction)), position
-        ), near
+        first, second = self._positions[left], self._positions[right]
+        position = first + fraction[:, None] * (second - first)
+        turned = slerp(self._quaternions[left], self._quaternions[right], fraction)
+        return compose(rotation_matrices(turned), position), near
 
     def nearest(self, stamp: int) -> float:
         """Seconds from a time to the nearest sample."""
         away = (self.times - stamp) / _NANOSECONDS
         return float(away[np.argmin(np.abs(away))])
-
-
-def unit_quaternion(rows: Sequence[Sequence[float]]) -> tuple[float, float, float, float]:
-    """The quaternion of a rotation, rows of three numbers or more; the stablest of four ways."""
-    (a, b, c), (d, e, f), (g, h, i) = (row[:3] for row in rows[:3])
-    ways = (1 + a - e - i, 1 - a + e - i, 1 - a - e + i, 1 + a + e + i)
-    way = ways.index(max(ways))
-    outer = (
-        (ways[0], b + d, c + g, h - f),
-        (b + d, ways[1], f + h, c - g),
-        (c + g, f + h, ways[2], d - b),
-        (h - f, c - g, d - b, ways[3]),
-    )[way]
-    length = math.sqrt(sum(value * value for value in outer))
-    x, y, z, w = outer
-    return x / length, y / length, z / length, w / length
-
-
-def _agree(one: FloatArray, other: FloatArray) -> bool:
-    """Whether two poses (7,) are the same; a quaternion and its negative are."""
-    same_side = other[3:] if one[3:] @ other[3:] >= 0.0 else -other[3:]
-    return bool(
-        np.abs(one[:3] - other[:3]).max() < _SAME and np.abs(one[3:] - same_side).max() < _SAME
-    )
 
 
 def _listed(names: list[str]) -> str:

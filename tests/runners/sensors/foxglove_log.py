@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.JointState_pb2 import JointState
-from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
-from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
-from foxglove_schemas_protobuf.Log_pb2 import Log
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
@@ -25,6 +17,8 @@ from tests.runners.sensors.small_logs import png
 
 def in_foxgloves_messages(source: Path, target: Path, *, packed: bool) -> Path:
     """Write the messages of one log into another, at the same times on the same topics.
+
+    Those without a counterpart are left out.
 
     packed: 16-bit images are PNG, each transform is a message of its own, and markers are pairs of
     key and value; otherwise images are rows, transforms come together, and markers are log lines.
@@ -37,7 +31,7 @@ def in_foxgloves_messages(source: Path, target: Path, *, packed: bool) -> Path:
         messages = make_reader(read, decoder_factories=[DecoderFactory()])
         for kind, channel, message, said in messages.iter_decoded_messages():
             assert kind is not None
-            for again in _said_again(kind.name, said, packed):
+            for again in _said_again(kind.name.split("/")[-1], said, packed):
                 if channel.topic not in channels:
                     name = again.DESCRIPTOR.full_name
                     schema = writer.register_schema(name, "protobuf", b"of no matter")
@@ -49,47 +43,70 @@ def in_foxgloves_messages(source: Path, target: Path, *, packed: bool) -> Path:
     return target
 
 
+def _made(kind: str, said: Any = None, **fields: Any) -> Any:
+    """A message of Foxglove's with the head of one of ROS 2."""
+    if said is not None:
+        stamp = said.header.stamp
+        fields |= {"timestamp": {"seconds": stamp.sec, "nanos": stamp.nanosec}}
+        fields |= {"frame_id": said.header.frame_id}
+    made = getattr(import_module(f"foxglove_schemas_protobuf.{kind}_pb2"), kind)
+    known = made.DESCRIPTOR.fields_by_name
+    return made(**{name: value for name, value in fields.items() if name in known})
+
+
 def _said_again(kind: str, said: Any, packed: bool) -> Iterator[Any]:
-    match kind.split("/")[-1]:
+    match kind:
         case "TFMessage":
             moved = [_transform(one) for one in said.transforms]
-            yield from moved if packed else [FrameTransforms(transforms=moved)]
+            yield from moved if packed else [_made("FrameTransforms", transforms=moved)]
         case "Image" if packed and said.encoding == "16UC1":
-            values = np.frombuffer(said.data, "<u2").reshape(said.height, said.width)
-            yield CompressedImage(format="png", data=png(values), **_head(said))
+            values = np.frombuffer(said.data, "<u2").reshape(said.height, -1)[:, : said.width]
+            yield _made("CompressedImage", said, format="png", data=png(values))
         case "Image":
             size = {"width": said.width, "height": said.height, "step": said.step}
-            yield RawImage(encoding=said.encoding, data=bytes(said.data), **size, **_head(said))
+            yield _made("RawImage", said, encoding=said.encoding, data=bytes(said.data), **size)
         case "CameraInfo":
             size = {"width": said.width, "height": said.height}
-            yield CameraCalibration(K=list(said.k), D=list(said.d), **size, **_head(said))
+            yield _made("CameraCalibration", said, K=list(said.k), D=list(said.d), **size)
         case "JointState":
             pairs = zip(said.name, said.position, strict=True)
-            joints = [JointState(name=name, position=value) for name, value in pairs]
-            yield JointStates(timestamp=_head(said)["timestamp"], joints=joints)
+            joints = [_made("JointState", name=name, position=value) for name, value in pairs]
+            yield _made("JointStates", said, joints=joints)
         case "String" if packed:
             key, _, value = said.data.partition(" ")
-            yield KeyValuePair(key=key, value=value)
+            yield _made("KeyValuePair", key=key, value=value)
         case "String":
-            yield Log(message=said.data)
-        case _:
-            raise AssertionError(f"no message of Foxglove's stands for {kind}")
+            yield _made("Log", message=said.data)
+        case "CompressedImage" if said.format == "png":
+            yield _made("CompressedImage", said, format="png", data=bytes(said.data))
+        case "PoseStamped":
+            yield _made("PoseInFrame", said, pose=_pose(said.pose))
+        case "PoseArray":
+            yield _made("PosesInFrame", said, poses=[_pose(one) for one in said.poses])
+        case "PointStamped":
+            yield _made("Point3InFrame", said, point=_xyz(said.point))
+        case "PointCloud2":
+            points = np.frombuffer(said.data).reshape(-1, 3)
+            fields = [{"name": name, "offset": 8 * k, "type": 8} for k, name in enumerate("xyz")]
+            pose = {"position": {"x": 1.0}, "orientation": {"w": 2.0}}
+            data = (points - [1.0, 0.0, 0.0]).tobytes()
+            yield _made("PointCloud", said, pose=pose, point_stride=24, fields=fields, data=data)
 
 
-def _transform(one: Any) -> FrameTransform:
-    t, q = one.transform.translation, one.transform.rotation
-    return FrameTransform(
-        timestamp=_head(one)["timestamp"],
+def _xyz(one: Any) -> dict[str, float]:
+    return {name: getattr(one, name) for name in "xyzw" if hasattr(one, name)}
+
+
+def _pose(one: Any) -> dict[str, Any]:
+    return {"position": _xyz(one.position), "orientation": _xyz(one.orientation)}
+
+
+def _transform(one: Any) -> Any:
+    return _made(
+        "FrameTransform",
+        one,
         parent_frame_id=one.header.frame_id,
         child_frame_id=one.child_frame_id,
-        translation={"x": t.x, "y": t.y, "z": t.z},
-        rotation={"x": q.x, "y": q.y, "z": q.z, "w": q.w},
+        translation=_xyz(one.transform.translation),
+        rotation=_xyz(one.transform.rotation),
     )
-
-
-def _head(said: Any) -> dict[str, Any]:
-    stamp = said.header.stamp
-    return {
-        "timestamp": {"seconds": stamp.sec, "nanos": stamp.nanosec},
-        "frame_id": said.header.frame_id,
-    }

@@ -1,4 +1,4 @@
-"""Small logs as robots write them, with one message or more of all kinds that are read."""
+"""Small logs as robots write them, with messages of all kinds that are read, and their sessions."""
 
 from __future__ import annotations
 
@@ -9,31 +9,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
-from foxglove_schemas_protobuf.Log_pb2 import Log
-from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
-from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
-from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
 from mcap_ros2.writer import Writer
 from PIL import Image
 
+from chsel.problem.poses import compose
 from chsel.sensing.depth_camera import PinholeCamera
-from runners.sensors.log.ros2_definitions import full_definition
-from runners.simulated_robot.log_writer import camera_info, header, image, joint_state
+from replay.events import Logged, Probe
+from runners.sensors.log.ros2_definitions import DEFINITIONS, full_definition
+from runners.sensors.rig import Rig
+from runners.sessions.sensors import SensorsSession, SensorsSettings
+from runners.simulated_robot.log_writer import camera_info, header, image, joint_state, transform
 
 SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND
-QUARTER_TURN = (0.0, 0.0, 0.5**0.5, 0.5**0.5)  # about z
 
 Sent = tuple[str, str, Any, int]  # topic, type, message, log time
+
+
+def read(
+    path: Path, rig: Rig, diameter: float | None = None
+) -> tuple[SensorsSession, list[Probe], str]:
+    """The session of a log, its probes, and what was told."""
+    session = SensorsSession(SensorsSettings(rig, str(path)), 0, diameter=diameter)
+    events = list(session.probes())
+    told = "\n".join(event.text for event in events if isinstance(event, Logged))
+    return session, [event for event in events if isinstance(event, Probe)], told
 
 
 def write_ros2(
@@ -58,65 +59,17 @@ def write_ros2(
     return path.read_bytes()
 
 
-def write_foxglove(path: Path, sent: Sequence[tuple[str, Any, int]]) -> bytes:
-    """A log of Foxglove's messages; its bytes."""
-    with path.open("wb") as file:
-        writer = McapWriter(file, chunk_size=2000)
-        writer.start()
-        channels: dict[str, int] = {}
-        for topic, message, log_time in sent:
-            if topic not in channels:
-                name = message.DESCRIPTOR.full_name
-                schema = writer.register_schema(name, "protobuf", b"of no matter")
-                channels[topic] = writer.register_channel(topic, "protobuf", schema)
-            writer.add_message(channels[topic], log_time, message.SerializeToString(), log_time)
-        writer.finish()
-    return path.read_bytes()
-
-
-def ros2_image(values: np.ndarray, stamp: int, **changes: Any) -> dict[str, Any]:
-    """A sensor_msgs/Image, its rows with four bytes of padding."""
-    rows = np.ascontiguousarray(values).view(np.uint8).reshape(len(values), -1)
-    rows = np.pad(rows, ((0, 0), (0, 4)))
-    return (
-        image("camera", values, stamp) | {"step": rows.shape[1], "data": rows.tobytes()} | changes
-    )
-
-
-def ros2_transform(
-    parent: str,
-    child: str,
-    position: Sequence[float],
-    stamp: int,
-    quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
-) -> dict[str, Any]:
-    """A geometry_msgs/TransformStamped."""
-    transform = {
-        "translation": dict(zip("xyz", position, strict=True)),
-        "rotation": dict(zip("xyzw", quaternion, strict=True)),
-    }
-    return {"header": header(parent, stamp), "child_frame_id": child, "transform": transform}
-
-
 def ros2_cloud(points: np.ndarray, stamp: int) -> dict[str, Any]:
-    """A sensor_msgs/PointCloud2 of one row: z first, y as float64, then four bytes of nothing."""
-    kind = np.dtype({"names": list("zxy"), "formats": [">f4", ">f4", ">f8"], "itemsize": 20})
-    packed = np.zeros(len(points), kind)
-    for axis, name in enumerate("xyz"):
-        packed[name] = points[:, axis]
-    fields = [
-        {"name": name, "offset": kind.fields[name][1], "datatype": 8 if name == "y" else 7}
-        for name in "zxy"
-    ]
+    """A sensor_msgs/PointCloud2 of one row of points (N, 3), as float64."""
+    fields = [{"name": n, "offset": 8 * k, "datatype": 8, "count": 1} for k, n in enumerate("xyz")]
     return {
         "header": header("lidar", stamp),
         "height": 1,
         "width": len(points),
-        "fields": [{**field, "count": 1} for field in fields],
-        "is_bigendian": True,
-        "point_step": 20,
-        "row_step": 20 * len(points),
-        "data": packed.tobytes(),
+        "fields": fields,
+        "point_step": 24,
+        "row_step": 24 * len(points),
+        "data": points.astype("<f8").tobytes(),
         "is_dense": True,
     }
 
@@ -133,96 +86,46 @@ def depth(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(300, 900, (3, 5)).astype(np.uint16)
 
 
+def xyz(*numbers: float) -> dict[str, float]:
+    """A vector, or a quaternion."""
+    return dict(zip("xyzw", numbers, strict=False))
+
+
 def ros2_sent(count: int = 4) -> list[Sent]:
     """What a robot sends in a few seconds; log times are 1 ms after the stamps."""
     sent: list[Sent] = []
     for step in range(count):
         stamp = BEGIN + step * SECOND
         camera, base = {"header": header("camera", stamp)}, {"header": header("base", stamp)}
-        fixed = ros2_transform("base", "camera", (0.0, 0.0, 1.0), stamp)
-        moved = ros2_transform("world", "base", (step, 0.0, 0.0), stamp)
+        above, moved = (compose(np.eye(3), np.array(p)) for p in ([0, 0, 1.0], [step, 0, 0.0]))
         info = camera_info("camera", PinholeCamera(5, 3, 400.0, 410.0, 2.0, 1.0), stamp)
         packed = {**camera, "format": "png", "data": png(depth(step))}
         quantised = struct.pack("<iff", 1, 100.0, -20.0) + packed["data"]
         inverse = {**camera, "format": "32FC1; compressedDepth png", "data": quantised}
-        pose = {
-            "position": {"x": 1.0, "y": 2.0, "z": 3.0},
-            "orientation": dict(zip("xyzw", QUARTER_TURN, strict=True)),
-        }
-        wrench = {
-            "force": {"x": 1.0, "y": 2.0, "z": -3.0},
-            "torque": {"x": 0.25, "y": 0.0, "z": 0.5},
-        }
-        joints = joint_state(["elbow", "wrist"], [0.5, -0.25], stamp)
-        cloud = ros2_cloud(np.arange(6.0).reshape(2, 3), stamp)
+        pose = {"position": xyz(1.0, 2.0, 3.0), "orientation": xyz(0.0, 0.0, 0.5**0.5, 0.5**0.5)}
+        wrench = {"force": xyz(1.0, 2.0, -3.0), "torque": xyz(0.25, 0.0, 0.5)}
         of_step: list[tuple[str, str, Any]] = [
-            ("/tf_static", "tf2_msgs/TFMessage", {"transforms": [fixed]}),
-            ("/tf", "tf2_msgs/TFMessage", {"transforms": [moved]}),
-            ("/depth", "sensor_msgs/Image", ros2_image(depth(step), stamp)),
-            ("/compressed", "sensor_msgs/CompressedImage", packed),
-            ("/quantised", "sensor_msgs/CompressedImage", inverse),
-            ("/info", "sensor_msgs/CameraInfo", info),
-            ("/pose", "geometry_msgs/PoseStamped", {**base, "pose": pose}),
-            ("/poses", "geometry_msgs/PoseArray", {**base, "poses": [pose, pose]}),
-            ("/point", "geometry_msgs/PointStamped", {**base, "point": {"x": 1.0, "z": 2.0}}),
             (
-                "/wrench",
-                "geometry_msgs/WrenchStamped",
-                {"header": header("hand", stamp), "wrench": wrench},
+                "/tf_static",
+                "TFMessage",
+                {"transforms": [transform("base", "camera", above, stamp)]},
             ),
-            ("/joints", "sensor_msgs/JointState", joints),
-            ("/cloud", "sensor_msgs/PointCloud2", cloud),
-            ("/probe", "std_msgs/String", {"data": f"begin {step}"}),
-            ("/touch", "std_msgs/Bool", {"data": step % 2 == 0}),
-            ("/count", "std_msgs/Int32", {"data": -step}),
+            ("/tf", "TFMessage", {"transforms": [transform("world", "base", moved, stamp)]}),
+            ("/depth", "Image", image("camera", depth(step), stamp)),
+            ("/compressed", "CompressedImage", packed),
+            ("/quantised", "CompressedImage", inverse),
+            ("/info", "CameraInfo", info),
+            ("/pose", "PoseStamped", {**base, "pose": pose}),
+            ("/poses", "PoseArray", {**base, "poses": [pose, pose]}),
+            ("/point", "PointStamped", {**base, "point": {"x": 1.0, "z": 2.0}}),
+            ("/wrench", "WrenchStamped", {"header": header("hand", stamp), "wrench": wrench}),
+            ("/joints", "JointState", joint_state(["elbow", "wrist"], [0.5, -0.25], stamp)),
+            ("/cloud", "PointCloud2", ros2_cloud(np.arange(6.0).reshape(2, 3), stamp)),
+            ("/probe", "String", {"data": f"begin {step}"}),
+            ("/touch", "Bool", {"data": step % 2 == 0}),
+            ("/count", "Int32", {"data": -step}),
         ]
-        sent += [(*one, stamp + 10**6) for one in of_step]
+        for topic, kind, message in of_step:
+            (name,) = (name for name in DEFINITIONS if name.split("/")[1] == kind)
+            sent.append((topic, name, message, stamp + 10**6))
     return sent
-
-
-def foxglove_sent() -> list[tuple[str, Any, int]]:
-    """A message of each kind of Foxglove's."""
-    x, y, z, w = QUARTER_TURN
-    time = {"seconds": BEGIN // SECOND, "nanos": 5}
-    pose = {
-        "position": {"x": 1.0, "y": 2.0, "z": 3.0},
-        "orientation": {"x": x, "y": y, "z": z, "w": w},
-    }
-    metres = np.array([[0.5, np.nan], [0.25, 2.0]], "<f4")
-    transform = FrameTransform(
-        timestamp=time,
-        parent_frame_id="world",
-        child_frame_id="base",
-        translation={"x": 1.0},
-        rotation={"x": 2 * x, "y": 2 * y, "z": 2 * z, "w": 2 * w},
-    )
-    fields = [
-        PackedElementField(name=name, offset=4 * index, type=PackedElementField.FLOAT32)
-        for index, name in enumerate("xyz")
-    ]
-    cloud = PointCloud(
-        timestamp=time,
-        frame_id="lidar",
-        pose=pose,
-        point_stride=12,
-        fields=fields,
-        data=np.array([[1.0, 0.0, 0.0]], "<f4").tobytes(),
-    )
-    info = CameraCalibration(timestamp=time, frame_id="camera", width=2, height=2)
-    info.K.extend([400.0, 0.0, 1.0, 0.0, 410.0, 0.5, 0.0, 0.0, 1.0])
-    image = RawImage(timestamp=time, frame_id="camera", width=2, height=2, encoding="32FC1")
-    image.step, image.data = 8, metres.tobytes()
-    packed = CompressedImage(timestamp=time, frame_id="camera", format="png", data=png(depth()))
-    sent = [
-        ("/tf", transform),
-        ("/transforms", FrameTransforms(transforms=[transform, transform])),
-        ("/depth", image),
-        ("/compressed", packed),
-        ("/info", info),
-        ("/pose", PoseInFrame(timestamp=time, frame_id="base", pose=pose)),
-        ("/poses", PosesInFrame(timestamp=time, frame_id="base", poses=[pose])),
-        ("/cloud", cloud),
-        ("/log", Log(timestamp=time, message="begin 1")),
-        ("/pair", KeyValuePair(key="begin", value="2")),
-    ]
-    return [(topic, message, BEGIN + index) for index, (topic, message) in enumerate(sent)]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,8 @@ from runners.simulated_robot.log_writer import (
     joint_state,
     transform,
 )
+from tests.runners.sensors.small_logs import BEGIN, SECOND, ros2_cloud
 
-SECOND = 10**9
-BEGIN = 1_700_000_000 * SECOND
 LATENCY = 4_000_000  # ns from a stamp to its log time
 
 CENTRE, RADIUS = np.array([0.9, 0.0, 0.45]), 0.04
@@ -39,6 +38,7 @@ HAND_FROM_PAD = compose(np.eye(3), np.array([0.0, 0.0, 0.1]))
 WORLD_FROM_CAMERA = compose(
     np.array([[0.6, 0.0, 0.8], [-0.8, 0.0, 0.6], [0.0, -1.0, 0.0]]), np.array([0.54, -0.27, 0.45])
 )
+LIDAR = np.array([0.72, 0.1, 0.55])  # m: its place in the world
 
 RIG = Rig(
     name="sphere",
@@ -54,15 +54,7 @@ RIG = Rig(
     hand=HandRig("hand", boxes=(BoxRig((0.04, 0.06, 0.08), (0.0, 0.0, 0.04)),)),
     markers="/probe",
 )
-
-
-class Writer(Protocol):
-    """Takes the messages: a LogWriter, or whoever wants to see them."""
-
-    def add(
-        self, topic: str, kind: str, message: dict[str, Any], stamp: int, log_time: int
-    ) -> None:
-        """One message; times in nanoseconds."""
+MARKS = ((0.95, "begin 0"), (2.95, "end 0"), (3.05, "begin 1"), (4.95, "end 1"))
 
 
 @dataclass(frozen=True)
@@ -71,81 +63,70 @@ class SphereLog:
 
     unit: metres of a unit of the camera's images. camera_clock: seconds by which it is ahead.
     lost_transforms: seconds between which the hand sends none. left_out: topics without messages.
-    finger: metres at which a joint of this name stands; None: no joint is told of.
+    finger: metres at which a joint of this name stands; None: no joint is told of. cloud: points
+    (N, 3) in the lidar's frame, sent on /lidar and /skin before and in the first probe.
     """
 
-    marks: tuple[tuple[float, str], ...] = (
-        (0.95, "begin 0"),
-        (2.95, "end 0"),
-        (3.05, "begin 1"),
-        (4.95, "end 1"),
-    )
+    marks: tuple[tuple[float, str], ...] = MARKS
     unit: float = 0.001
     camera_clock: float = 0.0
     lost_transforms: tuple[float, float] = (0.0, 0.0)
     left_out: tuple[str, ...] = ()
     finger: float | None = None
+    cloud: tuple[tuple[float, float, float], ...] = ()
 
     def write(self, path: Path) -> Path:
-        """The log as a file."""
+        """Five seconds: standing, a push onto the sphere, and one that passes it."""
         with LogWriter(path) as writer:
-            self.send(writer)
+            for tick in range(101):
+                self._send(writer, tick)
+            for seconds, text in self.marks:
+                self._add(writer, "/probe", "std_msgs/String", {"data": text}, time_of(seconds))
         return path
 
-    def send(self, writer: Writer) -> None:
-        """Five seconds: standing, a push onto the sphere, and one that passes it."""
-        for tick in range(101):
-            seconds = tick * 0.05
-            stamp = BEGIN + round(seconds * SECOND)
-            self._send(writer, tick, seconds, stamp)
-        for seconds, text in self.marks:
-            time = BEGIN + round(seconds * SECOND) + LATENCY
-            self._add(writer, "/probe", "std_msgs/String", {"data": text}, time, time)
-
-    def _send(self, writer: Writer, tick: int, seconds: float, stamp: int) -> None:
-        hand = hand_pose(seconds)
-        log = stamp + LATENCY
+    def _send(self, writer: LogWriter, tick: int) -> None:
+        seconds = tick * 0.05
+        stamp, hand = time_of(seconds), hand_pose(seconds)
         lost, found = self.lost_transforms
         if not lost <= seconds < found:
             moving = {"transforms": [transform("world", "hand", hand, stamp)]}
-            self._add(writer, "/tf", "tf2_msgs/TFMessage", moving, stamp, log)
+            self._add(writer, "/tf", "tf2_msgs/TFMessage", moving, stamp)
         if self.finger is not None:
             joints = joint_state(["elbow", "finger"], [seconds, self.finger], stamp)
-            self._add(writer, "/joint_states", "sensor_msgs/JointState", joints, stamp, log)
+            self._add(writer, "/joint_states", "sensor_msgs/JointState", joints, stamp)
         if tick == 0:
             fixed = [
                 transform("hand", "pad_frame", HAND_FROM_PAD, stamp),
                 transform("world", "camera_frame", WORLD_FROM_CAMERA, stamp),
+                transform("world", "lidar", compose(np.eye(3), LIDAR), stamp),
             ]
-            self._add(writer, "/tf_static", "tf2_msgs/TFMessage", {"transforms": fixed}, stamp, log)
+            self._add(writer, "/tf_static", "tf2_msgs/TFMessage", {"transforms": fixed}, stamp)
+        images = []
         if tick % 2 == 0:
-            depth = membrane(hand).astype(np.float32)
-            self._image(writer, "pad", INNER, depth, stamp, log)
+            images.append(("pad", INNER, membrane(hand).astype(np.float32), stamp))
         if tick % 10 == 0:
             ahead = stamp + round(self.camera_clock * SECOND)
-            numbers = np.rint(seen() / self.unit).astype(np.uint16)
-            self._image(writer, "camera", OUTER, numbers, ahead, log)
-
-    def _image(
-        self,
-        writer: Writer,
-        name: str,
-        camera: PinholeCamera,
-        values: np.ndarray,
-        stamp: int,
-        log: int,
-    ) -> None:
-        frame = f"{name}_frame"
-        info = camera_info(frame, camera, stamp)
-        self._add(writer, f"/{name}/info", "sensor_msgs/CameraInfo", info, stamp, log)
-        sent = image(frame, values, stamp)
-        self._add(writer, f"/{name}/depth", "sensor_msgs/Image", sent, stamp, log)
+            images.append(("camera", OUTER, np.rint(seen() / self.unit).astype(np.uint16), ahead))
+        for name, camera, values, seen_at in images:
+            info = camera_info(f"{name}_frame", camera, seen_at)
+            self._add(writer, f"/{name}/info", "sensor_msgs/CameraInfo", info, stamp)
+            depth = image(f"{name}_frame", values, seen_at)
+            self._add(writer, f"/{name}/depth", "sensor_msgs/Image", depth, stamp)
+        if self.cloud and tick in (10, 40):
+            cloud = ros2_cloud(np.array(self.cloud), stamp)
+            for topic in ("/lidar", "/skin"):
+                self._add(writer, topic, "sensor_msgs/PointCloud2", cloud, stamp)
 
     def _add(
-        self, writer: Writer, topic: str, kind: str, message: dict, stamp: int, log: int
+        self, writer: LogWriter, topic: str, kind: str, message: dict[str, Any], sent: int
     ) -> None:
         if topic not in self.left_out:
-            writer.add(topic, kind, message, stamp, log)
+            writer.add(topic, kind, message, sent, sent + LATENCY)
+
+
+def time_of(seconds: float) -> int:
+    """Nanoseconds."""
+    return BEGIN + round(seconds * SECOND)
 
 
 def hand_pose(seconds: float) -> FloatArray:
@@ -159,29 +140,25 @@ def hand_pose(seconds: float) -> FloatArray:
 
 def membrane(hand: FloatArray) -> FloatArray:
     """Depth (H, W) in the pad: the untouched plane, or the sphere where it is nearer."""
-    return np.minimum(MEMBRANE, to_sphere(INNER, hand @ HAND_FROM_PAD))
+    return np.minimum(MEMBRANE, _to_sphere(INNER, hand @ HAND_FROM_PAD))
 
 
 def seen() -> FloatArray:
     """Depth (H, W) in the camera: the sphere, or the wall behind it."""
-    return np.minimum(to_wall(OUTER, WORLD_FROM_CAMERA), to_sphere(OUTER, WORLD_FROM_CAMERA))
+    ways = OUTER.directions() @ WORLD_FROM_CAMERA[:3, :3].T
+    to_wall = (WALL - WORLD_FROM_CAMERA[0, 3]) / ways[..., 0]
+    return np.minimum(to_wall, _to_sphere(OUTER, WORLD_FROM_CAMERA))
 
 
-def to_sphere(camera: PinholeCamera, world_from_camera: FloatArray) -> FloatArray:
+def heights(points: FloatArray) -> FloatArray:
+    """Signed distance (N,) of points (N, 3) to the sphere."""
+    return np.sqrt(((points - CENTRE) ** 2).sum(axis=1)) - RADIUS
+
+
+def _to_sphere(camera: PinholeCamera, world_from_camera: FloatArray) -> FloatArray:
     """Depth (H, W) at which rays meet the sphere, infinite if they do not."""
     ways = camera.directions()
     centre = inverse(world_from_camera)[:3] @ [*CENTRE, 1.0]
     a, b = (ways**2).sum(axis=-1), ways @ centre
     root = b**2 - a * (centre @ centre - RADIUS**2)
     return np.where(root > 0.0, (b - np.sqrt(np.maximum(root, 0.0))) / a, np.inf)
-
-
-def to_wall(camera: PinholeCamera, world_from_camera: FloatArray) -> FloatArray:
-    """Depth (H, W) at which rays meet the wall."""
-    ways = camera.directions() @ world_from_camera[:3, :3].T
-    return (WALL - world_from_camera[0, 3]) / ways[..., 0]
-
-
-def changed(rig: Rig = RIG, **changes: object) -> Rig:
-    """The rig with other values."""
-    return replace(rig, **changes)

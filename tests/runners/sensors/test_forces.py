@@ -14,12 +14,13 @@ from chsel.errors import SessionError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse, roll_pitch_yaw
 from chsel.problem.settings import build_settings
-from replay.events import Logged, Probe
+from replay.events import Probe
 from runners.command.choices import CONF
 from runners.sensors.rig import Annotations, BoxRig, ForceRig, HandRig, Rig
-from runners.sessions.sensors import SensorsSession, SensorsSettings
+from runners.sensors.session_report import Counts
 from runners.simulated_robot.log_writer import header, transform
-from tests.runners.sensors.small_logs import BEGIN, SECOND, write_ros2
+from tests.runners.sensors import small_logs
+from tests.runners.sensors.small_logs import BEGIN, SECOND, write_ros2, xyz
 
 HAND = HandRig("hand", boxes=(BoxRig((0.04, 0.06, 0.1), (0.0, 0.0, 0.05)),))
 FORCES = ForceRig("/wrench")
@@ -45,34 +46,20 @@ def hand_pose(seconds: float) -> FloatArray:
     return compose(forward, np.array([0.3 + 0.1 * travel, 0.0, 0.1]))
 
 
-def wrench(seconds: float, *, torque: bool = True, settled: float = 0.0) -> dict[str, Any]:
-    """A geometry_msgs/WrenchStamped; the hand is in contact for 0.1 s.
+def wrench(seconds: float) -> FloatArray:
+    """Force and torque (6,) of a contact in the sensor's frame; it lasts for 0.1 s."""
+    if abs(seconds - 2.0) >= 0.055 and abs(seconds - 1.5) > 1e-6:  # a spike
+        return np.zeros(6)
+    sensor_from_hand = inverse(HAND_FROM_SENSOR)
+    force = sensor_from_hand[:3, :3] @ FORCE
+    return np.concatenate([force, np.cross(apply(sensor_from_hand, TIP[None])[0], force)])
+
+
+def write_log(path: Path, *, torque: bool = True, settled: float = 0.0, lacks: str = "") -> Path:
+    """Four seconds at 100 Hz; lacks: a topic without messages.
 
     settled: seconds before which the sensor measures twice the hand's weight.
     """
-    force, moment = np.zeros(3), np.zeros(3)
-    if abs(seconds - 2.0) < 0.055 or abs(seconds - 1.5) < 1e-6:  # and a spike
-        sensor_from_hand = inverse(HAND_FROM_SENSOR)
-        force = sensor_from_hand[:3, :3] @ FORCE
-        moment = np.cross(apply(sensor_from_hand, TIP[None])[0], force)
-    numbers = np.concatenate([force, moment]) + WEIGHT * (2.0 if seconds < settled else 1.0)
-    numbers = numbers if torque else np.concatenate([numbers[:3], np.zeros(3)])
-    parts = [dict(zip("xyz", part, strict=True)) for part in (numbers[:3], numbers[3:])]
-    return {
-        "header": header("ft", BEGIN + round(seconds * SECOND)),
-        "wrench": dict(zip(("force", "torque"), parts, strict=True)),
-    }
-
-
-def write_log(
-    path: Path,
-    *,
-    torque: bool = True,
-    settled: float = 0.0,
-    forces: bool = True,
-    marks: bool = True,
-) -> Path:
-    """Four seconds at 100 Hz."""
     fixed = {"transforms": [transform("hand", "ft", HAND_FROM_SENSOR, BEGIN)]}
     sent = [("/tf_static", "tf2_msgs/TFMessage", fixed, BEGIN)]
     for tick in range(401):
@@ -80,22 +67,26 @@ def write_log(
         stamp = BEGIN + round(seconds * SECOND)
         moving = {"transforms": [transform("world", "hand", hand_pose(seconds), stamp)]}
         sent.append(("/tf", "tf2_msgs/TFMessage", moving, stamp))
-        if forces:
-            felt = wrench(seconds, torque=torque, settled=settled)
-            sent.append(("/wrench", "geometry_msgs/WrenchStamped", felt, stamp))
-    for seconds, text in ((1.0, "begin 0"), (3.0, "end 0")) if marks else ():
-        stamp = BEGIN + round(seconds * SECOND)
-        sent.append(("/probe", "std_msgs/String", {"data": text}, stamp))
-    write_ros2(path, sorted(sent, key=lambda one: one[3]))
+        numbers = wrench(seconds) + WEIGHT * (2.0 if seconds < settled else 1.0)
+        felt = {"force": xyz(*numbers[:3]), "torque": xyz(*(torque * numbers[3:]))}
+        message = {"header": header("ft", stamp), "wrench": felt}
+        sent.append(("/wrench", "geometry_msgs/WrenchStamped", message, stamp))
+        if tick in (100, 300):
+            text = {"data": "begin 0" if tick == 100 else "end 0"}
+            sent.append(("/probe", "std_msgs/String", text, stamp))
+    write_ros2(path, [one for one in sent if one[0] != lacks])
     return path
 
 
-def read(path: Path, rig: Rig = RIG) -> tuple[SensorsSession, Probe, str]:
-    session = SensorsSession(SensorsSettings(rig, str(path)), 0)
-    events = list(session.probes())
-    told = "\n".join(event.text for event in events if isinstance(event, Logged))
-    (probe,) = (event for event in events if isinstance(event, Probe))
-    return session, probe, told
+def read(path: Path, **changes: Any) -> tuple[Counts, Probe, str]:
+    """What the forces gave, and what is known then; changes: of the rig."""
+    session, (probe,), told = small_logs.read(path, replace(RIG, **changes))
+    return session.report.total().get("/wrench", Counts()), probe, told
+
+
+def in_hand(probe: Probe) -> FloatArray:
+    """Contacts (C, 3) in the hand's frame at its furthest."""
+    return apply(inverse(hand_pose(2.0)), probe.contacts)
 
 
 @pytest.fixture(scope="module")
@@ -104,24 +95,19 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_contact_is_where_the_line_of_force_enters_the_hand(log: Path) -> None:
-    session, probe, told = read(log)
-    counts = session.report.total()["/wrench"]
+    counts, probe, told = read(log)
     assert len(probe.contacts) == counts.contacts == 2  # 10 mm of way are two voxels of 5 mm
-    in_hand = apply(inverse(hand_pose(2.0)), probe.contacts)
-    np.testing.assert_allclose(in_hand[:, :2], np.tile(TIP[:2], (2, 1)), atol=1e-5)
-    assert ((in_hand[:, 2] > TIP[2] - 0.0055) & (in_hand[:, 2] < TIP[2] + 1e-6)).all()
+    np.testing.assert_allclose(in_hand(probe)[:, :2], np.tile(TIP[:2], (2, 1)), atol=1e-5)
+    ahead = in_hand(probe)[:, 2]
+    assert ((ahead > TIP[2] - 0.0055) & (ahead < TIP[2] + 1e-6)).all()
     np.testing.assert_allclose(probe.contact_normals, [[-1.0, 0.0, 0.0]] * 2, atol=1e-6)
     assert probe.outcome == "contact"
     assert (counts.images, counts.used, counts.spikes) == (401, 201, 1)  # the spike
     assert "/wrench: left out of 401 messages: 1 of forces that do not last" in told
-
-
-def test_free_space_is_what_the_hand_swept_and_none_behind_the_contact(log: Path) -> None:
-    probe = read(log)[1]
+    # Free space is what the hand swept, and none behind the contact.
     free = probe.new_points.free
     assert len(free) > 300
-    foremost = hand_pose(2.0)[0, 3] + 0.1
-    assert free[:, 0].max() > foremost - 0.01
+    assert free[:, 0].max() > hand_pose(2.0)[0, 3] + 0.1 - 0.01
     near = np.sqrt(((free[:, None] - probe.contacts) ** 2).sum(axis=-1)).min(axis=1) < 0.0173
     assert (free[near, 0] <= probe.contacts[:, 0].max() + 1e-9).all()
 
@@ -131,89 +117,65 @@ def test_without_torques_the_foremost_part_of_the_hand_is_touched(
 ) -> None:
     square = replace(HAND, boxes=(replace(HAND.boxes[0], rotation=(0.0, 0.0, 0.4)),))
     path = write_log(tmp_path / "log.mcap", torque=False)
+    corner = roll_pitch_yaw(np.array([0.0, 0.0, 0.4]))[:2, :2] @ [-0.02, 0.03]
     for file, torque in ((path, True), (log, False)):
-        rig = replace(RIG, hand=square, forces=(replace(FORCES, torque=torque),))
-        probe = read(file, rig)[1]
-        in_hand = apply(inverse(hand_pose(2.0)), probe.contacts)
-        assert len(in_hand) > 0
-        corner = roll_pitch_yaw(np.array([0.0, 0.0, 0.4]))[:2, :2] @ [-0.02, 0.03]
-        np.testing.assert_allclose(in_hand[:, :2], np.tile(corner, (len(in_hand), 1)), atol=1e-6)
-        assert np.abs(in_hand[:, 2] - 0.1).max() < 0.0055
+        places = in_hand(read(file, hand=square, forces=(replace(FORCES, torque=torque),))[1])
+        assert len(places) > 0
+        np.testing.assert_allclose(places[:, :2], np.tile(corner, (len(places), 1)), atol=1e-6)
+        assert np.abs(places[:, 2] - 0.1).max() < 0.0055
 
 
 @pytest.mark.parametrize(
-    ("changes", "contacts", "outside"),
+    ("changes", "contacts"),
     [
-        ({"threshold": 7.0}, 0, 0),  # |FORCE| is 6.1 N
-        ({"samples": 12}, 0, 0),  # there are 11 in a row
-        ({"samples": 11}, 2, 0),
-        ({"points": 1}, 1, 0),
-        ({"acts": "by_hand", "points": 1}, 1, 0),  # the line then enters where it left
+        ({"threshold": 7.0}, 0),  # |FORCE| is 6.1 N
+        ({"samples": 12}, 0),  # there are 11 in a row
+        ({"samples": 11}, 2),
+        ({"points": 1}, 1),
+        ({"acts": "by_hand", "points": 1}, 1),  # the line then enters where it left
     ],
 )
-def test_settings_of_forces(
-    log: Path, changes: dict[str, Any], contacts: int, outside: int
-) -> None:
-    session, probe, _ = read(log, replace(RIG, forces=(replace(FORCES, **changes),)))
-    assert len(probe.contacts) == contacts
-    assert session.report.total()["/wrench"].outside == outside
-    in_hand = apply(inverse(hand_pose(2.0)), probe.contacts)
-    assert (in_hand[:, 2] < 0.06).all() == (contacts == 0 or "acts" in changes)
+def test_settings_of_forces(log: Path, changes: dict[str, Any], contacts: int) -> None:
+    counts, probe, _ = read(log, forces=(replace(FORCES, **changes),))
+    assert (len(probe.contacts), counts.outside) == (contacts, 0)
+    assert (in_hand(probe)[:, 2] < 0.06).all() == (contacts == 0 or "acts" in changes)
 
 
 def test_a_line_of_force_that_misses_the_hand_is_left_out(log: Path) -> None:
     thin = replace(HAND, boxes=(BoxRig((0.01, 0.01, 0.1), (0.0, 0.0, 0.05)),))
     for reach, outside in ((0.004, 11), (0.05, 0)):
-        rig = replace(RIG, hand=thin, forces=(replace(FORCES, reach=reach),))
-        session, probe, told = read(log, rig)
-        assert session.report.total()["/wrench"].outside == outside
-        assert ("11 out of reach" in told) == (outside == 11)
-        assert (len(probe.contacts) == 0) == (outside == 11)
+        counts, probe, told = read(log, hand=thin, forces=(replace(FORCES, reach=reach),))
+        assert counts.outside == outside
+        assert ("11 out of reach" in told) == (len(probe.contacts) == 0) == (outside == 11)
 
 
-def test_a_log_without_markers_is_tared_by_its_beginning(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "log.mcap", marks=False)
-    _, probe, told = read(path, replace(RIG, markers=None))
+def test_the_tare_is_of_the_last_seconds_before_a_probe_or_of_the_first(
+    log: Path, tmp_path: Path
+) -> None:
+    unmarked = write_log(tmp_path / "unmarked.mcap", lacks="/probe")
+    _, probe, told = read(unmarked, markers=None)
     assert len(probe.contacts) == 2
     assert "/wrench: nothing came before the first probe: its first 1 s are its tare" in told
-
-
-def test_the_tare_is_of_the_last_seconds_before_a_probe_alone(log: Path, tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", settled=0.7)  # of the second before the probe
-    brief = replace(RIG, forces=(replace(FORCES, tare=0.25),))
-    found, expected = (read(file, brief)[1].contacts for file in (path, log))
+    brief = replace(FORCES, tare=0.25)
+    found, expected = (read(file, forces=(brief,))[1].contacts for file in (path, log))
     assert len(expected) == 2
     np.testing.assert_array_equal(found, expected)
 
 
-def test_a_hand_alone_gives_free_space_and_annotated_contacts(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "log.mcap", forces=False)
-    alone = replace(RIG, forces=())
-    session, probe, _ = read(path, alone)
+def test_a_hand_alone_gives_free_space(log: Path, tmp_path: Path) -> None:
+    without = write_log(tmp_path / "log.mcap", lacks="/wrench")
+    _, probe, _ = read(without, forces=())
     assert (probe.outcome, len(probe.contacts)) == ("free", 0)
     assert len(probe.new_points.free) > 300
-    assert list(session.report.total()) == ["hand"]
-    extra = Annotations(exclude=(0,))
-    assert len(read(path, replace(alone, annotations=extra))[1].contacts) == 0
-
-
-def test_contacts_of_excluded_probes_are_left_out(log: Path) -> None:
-    excluded = replace(RIG, annotations=Annotations(exclude=(0,)))
-    assert len(read(log, excluded)[1].contacts) == 0
-
-
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
-    without = write_log(tmp_path / "log.mcap", forces=False)
+    assert len(read(log, annotations=Annotations(exclude=(0,)))[1].contacts) == 0
     with pytest.raises(SessionError, match=r"lacks what rig pusher names: /wrench \(forces\)"):
         read(without)
     with pytest.raises(SettingError, match=r"forces need the solids of the hand.*hand\.boxes"):
         replace(RIG, hand=HandRig("hand"))
-    with pytest.raises(SettingError, match=r"rig pusher has no sensor; accepted: .*clouds, hand"):
-        read(without, replace(RIG, hand=None, forces=()))
 
 
 def test_the_rig_to_start_from_is_read() -> None:
     values = yaml.safe_load((CONF / "session" / "rig" / "wrist_force.yaml").read_text())
     rig = build_settings(Rig, values, "session.rig")
     assert rig.forces == (ForceRig("/wrist/wrench"),)
-    assert rig.hand is not None

@@ -8,7 +8,6 @@ import pytest
 import trimesh
 
 from chsel.errors import SettingError
-from chsel.problem.poses import roll_pitch_yaw
 from runners.sensors.hand import HandModel
 from runners.sensors.rig import BoxRig, HandRig
 
@@ -23,7 +22,6 @@ GRIPPER = """<?xml version="1.0"?>
   </link>
   <joint name="slide" type="prismatic">
     <parent link="palm"/><child link="left"/><axis xyz="0 2 0"/><origin xyz="0 0 0.1"/>
-    <limit lower="0" upper="0.1" effort="1" velocity="1"/>
   </joint>
   <link name="left">
     <collision><geometry><cylinder radius="0.01" length="0.06"/></geometry></collision>
@@ -64,29 +62,23 @@ def hand(path: str, root: str | None = None) -> HandRig:
 
 
 def test_boxes_stand_where_the_rig_puts_them() -> None:
-    boxes = (
-        BoxRig((0.1, 0.2, 0.3), (1.0, 0.0, 0.0)),
-        BoxRig((0.1, 0.2, 0.3), rotation=(np.pi / 2, 0.0, np.pi / 2)),
-    )
+    turned = (np.pi / 2, 0.0, np.pi / 2)
+    boxes = BoxRig((0.1, 0.2, 0.3), (1.0, 0.0, 0.0)), BoxRig((0.1, 0.2, 0.3), rotation=turned)
     solids = HandModel(HandRig(frame="hand", boxes=boxes)).solids()
     assert solids is not None
     assert solids.is_watertight
     assert solids.volume == pytest.approx(2 * 0.006)
-    upright, turned = solids.split()
+    upright, lying = solids.split()
     np.testing.assert_allclose(upright.bounds, [[0.95, -0.1, -0.15], [1.05, 0.1, 0.15]])
     # First about x: y and z change places; then about z: x and y do.
-    np.testing.assert_allclose(turned.extents, [0.3, 0.1, 0.2], atol=1e-12)
+    np.testing.assert_allclose(lying.extents, [0.3, 0.1, 0.2], atol=1e-12)
 
 
-def test_angles_turn_about_fixed_axes_in_the_order_of_urdf() -> None:
-    angles = np.array([0.3, -0.7, 1.1])
-    expected = trimesh.transformations.euler_matrix(*angles, axes="sxyz")[:3, :3]
-    np.testing.assert_allclose(roll_pitch_yaw(angles), expected, atol=1e-12)
-
-
-def test_joints_place_the_links(tmp_path: Path) -> None:
-    joints = {"slide": 0.02, "bend": 0.4, "elbow": 7.0}
-    model = HandModel(hand(urdf(tmp_path), "palm"))
+@pytest.mark.parametrize("arm", ["revolute", "planar"])
+def test_joints_place_the_links(tmp_path: Path, arm: str) -> None:
+    """arm: what its joint is, whose values do not matter to the hand."""
+    joints = {"slide": 0.02, "bend": 0.4, "elbow": 7.0, "wrist": 9.0}
+    model = HandModel(hand(urdf(tmp_path, GRIPPER.replace("revolute", arm)), "palm"))
     palm, left, right, tip = model.parts(joints)
     assert model.joint_names == ("slide", "bend")
     assert list(model.warnings) == []
@@ -96,21 +88,10 @@ def test_joints_place_the_links(tmp_path: Path) -> None:
     np.testing.assert_allclose(right.bounds.mean(axis=0), [0.0, -0.05, 0.1], atol=1e-12)
     np.testing.assert_allclose(tip.bounds.mean(axis=0), [0.0, -0.02, 0.1], atol=1e-12)
     assert all(part.is_watertight and part.volume > 0.0 for part in model.parts(joints))
-
-
-def test_a_continuous_joint_turns_what_hangs_on_it(tmp_path: Path) -> None:
-    text = GRIPPER.replace('<axis xyz="1 0 0"/>', '<axis xyz="0 0 2"/>')
-    model = HandModel(hand(urdf(tmp_path, text), "right"))
-    right, tip = model.parts({"bend": np.pi / 2})
+    turning = GRIPPER.replace('<axis xyz="1 0 0"/>', '<axis xyz="0 0 2"/>')
+    _, tip = HandModel(hand(urdf(tmp_path, turning), "right")).parts({"bend": np.pi / 2})
     # 90 degrees of the origin and 90 of the joint turn x into -x.
     np.testing.assert_allclose(tip.bounds.mean(axis=0), [-0.03, 0.0, 0.0], atol=1e-9)
-    np.testing.assert_allclose(right.bounds.mean(axis=0), [0.0, 0.0, 0.0], atol=1e-9)
-
-
-def test_a_follower_that_tells_its_own_value_is_believed(tmp_path: Path) -> None:
-    model = HandModel(hand(urdf(tmp_path), "palm"))
-    right = model.parts({"slide": 0.02, "follow": 0.03})[2]
-    np.testing.assert_allclose(right.bounds.mean(axis=0), [0.0, -0.03, 0.1], atol=1e-12)
 
 
 def test_the_base_is_the_root_unless_another_is_named(tmp_path: Path) -> None:
@@ -118,8 +99,6 @@ def test_the_base_is_the_root_unless_another_is_named(tmp_path: Path) -> None:
     assert len(whole.parts()) == 5
     assert whole.joint_names == ("wrist", "slide", "bend")
     np.testing.assert_allclose(whole.parts()[1].bounds[:, 2], [1.0, 1.1])
-    with pytest.raises(SettingError, match=r"'wrist' is not one of .*accepted: arm, palm"):
-        HandModel(hand(urdf(tmp_path), "wrist"))
 
 
 def test_meshes_are_found_beside_the_urdf_and_in_its_packages(tmp_path: Path) -> None:
@@ -135,20 +114,14 @@ def test_meshes_are_found_beside_the_urdf_and_in_its_packages(tmp_path: Path) ->
         np.testing.assert_allclose(palm.extents, [0.01, 0.02, 0.06])
         assert palm.volume == pytest.approx(12e-6)  # mirrored, and still turned outward
     path = one_link(package / "urdf", '<mesh filename="package://other/palm.stl"/>')
-    with pytest.raises(SettingError, match=r"link a: mesh package://other/palm.stl does not exist"):
+    with pytest.raises(SettingError, match=r"mesh package://other/palm.stl does not exist in or"):
         HandModel(hand(path))
-
-
-def test_an_open_mesh_becomes_its_hull(tmp_path: Path) -> None:
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     trimesh.Trimesh(box.vertices, box.faces[2:]).export(tmp_path / "open.stl")
     model = HandModel(hand(one_link(tmp_path, '<mesh filename="open.stl"/>')))
     (solid,) = model.parts()
-    assert solid.is_watertight
-    assert solid.volume == pytest.approx(1e-3)
-    assert ["open.stl is open; its convex hull is used" in text for text in model.warnings] == [
-        True
-    ]
+    assert (solid.is_watertight, solid.volume) == (True, pytest.approx(1e-3))
+    assert "a mesh of link a is open; its convex hull is used" in "".join(model.warnings)
 
 
 def test_without_yourdfpy_boxes_work_and_a_urdf_names_the_extra(
@@ -158,57 +131,16 @@ def test_without_yourdfpy_boxes_work_and_a_urdf_names_the_extra(
     assert HandModel(HandRig(frame="hand", boxes=(BoxRig((0.1, 0.1, 0.1)),))).solids() is not None
     with pytest.raises(SettingError, match=r"pip install -e '\.\[sensors\]'"):
         HandModel(hand(urdf(tmp_path)))
-    with pytest.raises(SettingError, match=r"hand.urdf nofile.urdf does not exist"):
-        HandModel(HandRig(frame="hand", urdf="nofile.urdf"))
-
-
-def test_values_that_yourdfpy_takes_otherwise(tmp_path: Path) -> None:
-    """A chain of mimics, which it follows by one joint, and a planar joint ahead, which shifts it.
-
-    (Neither is a prismatic joint as far along a longer axis, above.)
-    """
-    shape = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
-    joint = '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/>{}</joint>'
-    moved = '<axis xyz="1 0 0"/><mimic joint="{}" multiplier="2" offset="0.01"/>'
-    parts = [
-        '<link name="base"/><link name="a"/>',
-        *(f'<link name="{name}">{shape}</link>' for name in "bcd"),
-        joint.format("plane", "planar", "base", "a", ""),
-        joint.format("first", "prismatic", "a", "b", '<axis xyz="1 0 0"/>'),
-        joint.format("second", "prismatic", "a", "c", moved.format("first")),
-        joint.format("third", "prismatic", "a", "d", moved.format("second")),
-    ]
-    model = HandModel(hand(urdf(tmp_path, f'<robot name="r">{"".join(parts)}</robot>')))
-    assert model.joint_names == ("first",)
-    assert "joint plane is planar; it stays at its origin" in "".join(model.warnings)
-    centres = [part.bounds.mean(axis=0)[0] for part in model.parts({"first": 0.1, "plane": 9.0})]
-    np.testing.assert_allclose(centres, [0.1, 0.21, 0.43], atol=1e-12)
-
-
-LINK = '<link name="a"><collision><geometry><sphere radius="1"/></geometry></collision></link>'
-CYCLE = (
-    '<robot name="r"><link name="a"/><link name="b"/>'
-    '<joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint>'
-    '<joint name="k" type="fixed"><parent link="b"/><child link="a"/></joint></robot>'
-)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("<robot", "is not a URDF"),
-        ("<robot/>", "is not a URDF"),
+        ("<robot", "cannot be read"),
         ('<robot name="r"><link name="a"/></robot>', "no collision shape at or below link a"),
-        (f'<robot name="r">{LINK}<link name="b"/></robot>', r"hand\.root None is .*: a, b"),
         ('<robot name="r" xmlns:xacro="x"><xacro:arm/></robot>', "holds xacro macros"),
-        (CYCLE, "is not a tree"),
-        (GRIPPER.replace('child link="tip"', 'child link="left"'), "is not a tree"),
-        (GRIPPER.replace('link="arm"', 'link="leg"'), "joint wrist joins 'leg', 'palm'"),
-        (GRIPPER.replace('type="revolute"', 'type="screw"'), "joint wrist has type 'screw'"),
-        (GRIPPER.replace('"0 2 0"', '"0 0 0"'), "joint slide: axis is"),
-        (GRIPPER.replace('mimic joint="slide"', 'mimic joint="follow"'), "follow mimics 'follow'"),
-        (GRIPPER.replace('mimic joint="slide"', 'mimic joint="thumb"'), "follow mimics 'thumb'"),
-        (GRIPPER.replace('radius="0.01"', 'radius="-1"'), "link left: size "),
+        (GRIPPER.replace('child link="tip"', 'child link="left"'), "a tree of links"),
+        (GRIPPER.replace('mimic joint="slide"', 'mimic joint="follow"'), "follow mimics follow"),
     ],
 )
 def test_unusable_files_are_refused_in_a_line(tmp_path: Path, text: str, message: str) -> None:

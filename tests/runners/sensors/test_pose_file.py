@@ -16,29 +16,17 @@ POSE = compose(rotation_vector(np.array([0.3, -1.2, 0.4])), np.array([0.9, -0.05
 ROWS = "world_from_object: [[1,0,0,0.5],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
 
 
-def test_a_pose_is_read_as_it_was_written_with_all_that_stands_beside_it(tmp_path: Path) -> None:
-    path = tmp_path / "log.pose.yaml"
+def test_a_pose_is_read_as_it_was_written_and_replaced_if_that_is_wanted(tmp_path: Path) -> None:
+    path = beside(tmp_path / "a.b.mcap")
+    assert path == beside(tmp_path / "a.b") == tmp_path / "a.b.pose.yaml"
     write_pose(path, POSE, {"cost": 0.25, "search": {"spans": (1, 2)}})
-    np.testing.assert_allclose(read_pose(path), POSE, atol=1e-15)
-    written = yaml.safe_load(path.read_text())
-    assert (written["cost"], written["search"]) == (0.25, {"spans": [1, 2]})
-
-
-def test_a_pose_file_is_replaced_only_if_that_is_wanted(tmp_path: Path) -> None:
-    path = tmp_path / "log.pose.yaml"
-    write_pose(path, POSE, {})
     with pytest.raises(RecordingError, match="exists; accepted: the name of a new file"):
         write_pose(path, np.eye(4), {})
     np.testing.assert_allclose(read_pose(path), POSE, atol=1e-15)
+    written = yaml.safe_load(path.read_text())
+    assert (written["cost"], written["search"]) == (0.25, {"spans": [1, 2]})
     write_pose(path, np.eye(4), {}, overwrite=True)
     np.testing.assert_array_equal(read_pose(path), np.eye(4))
-    assert [file.name for file in tmp_path.iterdir()] == ["log.pose.yaml"]
-
-
-def test_the_pose_of_a_log_is_beside_it(tmp_path: Path) -> None:
-    assert beside(tmp_path / "a.b.mcap") == tmp_path / "a.b.pose.yaml"
-    assert beside(tmp_path / "bag_2024.01.02") == tmp_path / "bag_2024.01.02.pose.yaml"
-    assert beside("log.mcap").is_absolute()
 
 
 def test_a_rotation_written_by_hand_is_made_exact(tmp_path: Path) -> None:
@@ -59,14 +47,14 @@ def test_a_rotation_written_by_hand_is_made_exact(tmp_path: Path) -> None:
         (ROWS.replace("0.5", ".nan"), "not finite"),
         (ROWS.replace("[[1,", "[[2,"), "world_from_object.* not a rigid"),
         ("world_from_object: [[[", "not YAML"),
+        (None, r"pose file .* cannot be read"),
     ],
 )
-def test_another_file_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+def test_another_file_is_one_line(tmp_path: Path, text: str | None, message: str) -> None:
     path = tmp_path / "pose.yaml"
-    path.write_text(text)
+    if text is not None:
+        path.write_text(text)
     with pytest.raises(SessionError, match=message) as error:
         read_pose(path)
     assert "\n" not in str(error.value)
     assert "accepted: YAML with world_from_object" in str(error.value)
-    with pytest.raises(SessionError, match=r"pose file .* cannot be read"):
-        read_pose(tmp_path / "none.yaml")

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from chsel.numerics.arrays import FloatArray
-from chsel.sensing.depth_camera import PinholeCamera
+from runners.simulated_robot.cabinet import CAP, CAP_BASE
 from runners.simulated_robot.pads import TAUTNESS, Membrane
 from runners.simulated_robot.settings import BubbleSettings
-from runners.simulated_robot.wrist import CAP, CAP_BASE
 
 CAMERA = BubbleSettings().pinhole
 APEX = CAP_BASE + CAP[2]
@@ -56,16 +54,10 @@ def test_beside_a_straight_edge_the_dent_falls_as_that_of_a_taut_sheet(width: in
     wide = Membrane(camera)
     beyond = np.full(wide.rest.shape, 1.0)
     beyond[:, : width // 2] = wide.rest[:, : width // 2] - 0.004
-    dent = _dent_along_the_middle(wide, camera, beyond)
+    dent = (wide.rest - wide.pressed(beyond))[camera.height // 2]
     pitch = APEX / camera.fx
     away = round(TAUTNESS / pitch)
     edge = width // 2 - 1
     assert dent[edge] == pytest.approx(0.004, abs=1e-12)
     expected = 0.004 * np.exp(-away * pitch / TAUTNESS)
     assert dent[edge + away] == pytest.approx(expected, rel=0.05)
-
-
-def _dent_along_the_middle(
-    membrane: Membrane, camera: PinholeCamera, beyond: FloatArray
-) -> FloatArray:
-    return (membrane.rest - membrane.pressed(beyond))[camera.height // 2]

@@ -1,4 +1,4 @@
-"""The tree of transforms: interpolation, gaps, and trees that are none."""
+"""The tree of transforms: interpolation, gaps, and trees that are none; joints over time."""
 
 from types import SimpleNamespace
 
@@ -10,7 +10,12 @@ from chsel.problem.poses import axis_angle, compose, inverse, random_rotations, 
 from runners.sensors.log.clocks import ClockCorrection
 from runners.sensors.log.decoding import rigid
 from runners.sensors.log.messages import Received, TransformMessage
-from runners.sensors.log.transforms import TransformError, TransformTree, unit_quaternion
+from runners.sensors.log.transforms import (
+    MOST_OF_A_PROBE,
+    JointHistory,
+    TransformError,
+    TransformTree,
+)
 
 SECOND = 10**9
 X, Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -20,17 +25,12 @@ def pose(x: float = 0.0, angle: float = 0.0, axis: FloatArray = Z) -> FloatArray
     return compose(axis_angle(axis, angle), np.array([x, 0.0, 0.0]))
 
 
-def tree(*transforms: tuple[float, str, str, FloatArray]) -> TransformTree:
-    """Transforms at seconds; None of them static."""
-    messages = [(time, TransformMessage(*parts)) for time, *parts in transforms]
-    return added(*((int(time * SECOND), message) for time, message in messages))
-
-
-def added(*messages: tuple[int, TransformMessage]) -> TransformTree:
-    """Transforms at nanoseconds."""
+def tree(*transforms: tuple[float, str, str, FloatArray], static: bool = False) -> TransformTree:
+    """Transforms at seconds."""
     made = TransformTree()
-    for time, message in messages:
-        made.add(Received("/tf", time, None, message), message)
+    for seconds, *parts in transforms:
+        message = TransformMessage(*parts, static=static)
+        made.add(Received("/tf", int(seconds * SECOND), None, message), message)
     made.settle(ClockCorrection())
     return made
 
@@ -43,20 +43,24 @@ def test_between_samples_it_goes_straight_and_along_the_shorter_arc() -> None:
         np.testing.assert_allclose(found, pose(x, angle), atol=1e-12)
         back = moving.lookup("b", "a", int(time * SECOND), gap_s=1.0)
         np.testing.assert_allclose(back, inverse(pose(x, angle)), atol=1e-12)
+    first, second = random_rotations(np.random.default_rng(2), 2)
+    made = tree(*((k, "a", "b", compose(r, np.zeros(3))) for k, r in enumerate((first, second))))
+    found = made.lookup("a", "b", int(0.1 * SECOND), gap_s=1.0)
+    expected = 0.1 * rotation_angle(first.T @ second)
+    np.testing.assert_allclose(rotation_angle(first.T @ found[:3, :3]), expected, atol=1e-12)
 
 
 def test_a_chain_joins_static_and_moving_frames_over_their_common_root() -> None:
-    camera = pose(0.5, 0.3, X)
-    made = added(
-        (0, TransformMessage("world", "arm", pose(1.0, np.pi / 2))),
-        (SECOND, TransformMessage("world", "arm", pose(1.0, np.pi / 2))),
-        (0, TransformMessage("world", "stand", pose(-1.0))),
-        (SECOND, TransformMessage("world", "stand", pose(-3.0))),
-        (0, TransformMessage("arm", "camera", camera, static=True)),
+    camera, turned = pose(0.5, 0.3, X), pose(1.0, np.pi / 2)
+    made = tree(
+        *((time, "world", "arm", turned) for time in (0, 1)),
+        (0, "world", "stand", pose(-1.0)),
+        (1, "world", "stand", pose(-3.0)),
     )
+    static = TransformMessage("arm", "camera", camera, static=True)
+    made.add(Received("/tf_static", 0, None, static), static)
     found = made.lookup("stand", "camera", SECOND // 2, gap_s=1.0)
-    expected = inverse(pose(-2.0)) @ pose(1.0, np.pi / 2) @ camera
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(found, inverse(pose(-2.0)) @ turned @ camera, atol=1e-12)
     np.testing.assert_array_equal(made.lookup("arm", "arm", 5, gap_s=1.0), np.eye(4))
 
 
@@ -67,8 +71,7 @@ def test_order_and_repetition_do_not_matter() -> None:
     stamps = random.integers(0, 29 * SECOND // 10, 50)
     expected, all_valid = tree(*samples).lookups("a", "b", stamps, gap_s=0.2)
     found, valid = tree(*mixed).lookups("a", "b", stamps, gap_s=0.2)
-    assert all_valid.all()
-    assert valid.all()
+    assert (all_valid & valid).all()
     np.testing.assert_array_equal(found, expected)
 
 
@@ -78,8 +81,7 @@ def test_stamps_of_a_clock_that_is_ahead_are_put_right() -> None:
         for topic, child, stamp in (("/tf", "b", time + ahead), ("/arm", "c", time)):
             message = TransformMessage("a", child, pose(time / SECOND))
             made.add(Received(topic, time + 5, stamp, message), message)
-    shifts, medians = {"/tf": -ahead}, {"/tf": ahead - 5, "/arm": -5}
-    made.settle(ClockCorrection(shifts=shifts, medians=medians, jump=SECOND))
+    made.settle(ClockCorrection({"/tf": -ahead}))
     assert made.times.tolist() == [SECOND, 2 * SECOND]
     found = made.lookup("b", "c", 3 * SECOND // 2, gap_s=1.0)
     np.testing.assert_allclose(found, pose(0.0), atol=1e-12)
@@ -110,7 +112,8 @@ def test_what_is_missing_is_said() -> None:
         TransformTree().lookup("a", "b", 0, gap_s=1.0)
 
 
-def test_two_parents_and_cycles_are_faults_and_the_first_counts() -> None:
+def test_contradictions_are_faults() -> None:
+    """Of parents the first counts, of static places the latest."""
     made = tree(
         (0, "a", "b", pose(1.0)),
         (0, "b", "c", pose(2.0)),
@@ -124,39 +127,37 @@ def test_two_parents_and_cycles_are_faults_and_the_first_counts() -> None:
         "frame d is its own ancestor, by way of d": 1,
     }
     np.testing.assert_allclose(made.lookup("a", "c", 0, gap_s=1.0), pose(3.0))
-    assert made.frames == ["a", "b", "c"]
-
-
-def test_of_static_transforms_the_latest_holds_and_a_change_is_a_fault() -> None:
     places = ((5, 1.0), (9, 2.0), (7, 3.0), (9, 2.0))
-    made = added(*((time, TransformMessage("a", "b", pose(x), static=True)) for time, x in places))
+    made = tree(*((time, "a", "b", pose(x)) for time, x in places), static=True)
     np.testing.assert_allclose(made.lookup("a", "b", 10**18, gap_s=0.1), pose(2.0))
     assert made.faults == {"frame b is static in several places": 2}
 
 
-def xyz(*values: float) -> SimpleNamespace:
-    """A vector or quaternion as messages have it."""
-    return SimpleNamespace(**dict(zip("xyzw", values, strict=False)))
+def test_quaternions_of_any_length_are_rotations() -> None:
+    for angle in (0.0, 1.2, np.pi):
+        for axis in np.eye(3):
+            x, y, z = np.sin(angle / 2) * 1e300 * axis
+            turn = SimpleNamespace(x=x, y=y, z=z, w=np.cos(angle / 2) * 1e300)
+            found = rigid(SimpleNamespace(x=1.0, y=0.0, z=0.0), turn)
+            np.testing.assert_allclose(found, pose(1.0, angle, axis), atol=1e-14)
 
 
-def test_quaternions_and_rotations_are_each_others_inverse() -> None:
-    turns = random_rotations(np.random.default_rng(1), 200)
-    halves = [axis_angle(axis, np.pi) for axis in np.eye(3)]  # where the usual formula divides by 0
-    for rotation in [*turns, np.eye(3), *halves]:
-        transform = compose(rotation, np.array([1.0, 2.0, 3.0]))
-        quaternion = unit_quaternion(transform.tolist())
-        again = rigid(xyz(1.0, 2.0, 3.0), xyz(*(1e300 * value for value in quaternion)))
-        np.testing.assert_allclose(again, transform, atol=1e-14)
+def history(*positions: dict[str, float]) -> JointHistory:
+    """Positions at times 0, 10, 20, ..."""
+    joints = JointHistory(["finger"])
+    for index, values in enumerate(positions):
+        joints.add(Received("/joints", 10 * index, None, ""), values)
+    joints.settle(ClockCorrection())
+    return joints
 
 
-def test_interpolation_turns_at_a_constant_rate() -> None:
-    first, second = random_rotations(np.random.default_rng(2), 2)
-    whole = rotation_angle(first.T @ second)
-    made = tree(
-        (0, "a", "b", compose(first, np.zeros(3))), (1, "a", "b", compose(second, np.zeros(3)))
-    )
-    for fraction in (0.1, 0.5, 0.8):
-        found = made.lookup("a", "b", int(fraction * SECOND), gap_s=1.0)
-        np.testing.assert_allclose(
-            rotation_angle(first.T @ found[:3, :3]), fraction * whole, atol=1e-12
-        )
+def test_a_state_of_the_joints_holds_until_the_next() -> None:
+    moved = [0.1 if time >= 500 else 0.001 * (time % 20) for time in range(0, 1000, 10)]
+    joints = history(*({"finger": value, "elbow": 10.0 * n} for n, value in enumerate(moved)))
+    assert joints.first() == {"finger": 0.0}
+    assert joints.during(100, 400) == [(100, {"finger": 0.0})]
+    assert joints.during(400, 600) == [(400, {"finger": 0.0}), (500, {"finger": 0.1})]
+    assert joints.during(600, 700) == [(600, {"finger": 0.1})]
+    assert history().during(0, 9) == [(0, {})]
+    busy = history(*({"finger": float(time)} for time in range(1000)))
+    assert len(busy.during(0, 10_000)) <= MOST_OF_A_PROBE
