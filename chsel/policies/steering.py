@@ -56,6 +56,7 @@ class Steering:
         points: all that are known. available (A,): the actions that can be taken now. Raises
         ChselError if the policy, of another package, gives something else than a decision.
         """
+        require_parts(points=points)
         key = StreamKey(self.seed, done)
         known = self.sdf, points, self.workspace, self.free_resolution
         belief = self.belief(points, hypotheses, key)

@@ -119,20 +119,6 @@ def test_on_a_flat_target_two_particles_part_along_their_difference() -> None:
     np.testing.assert_allclose(phi, [expected, -expected], rtol=1e-12)
 
 
-def test_a_particle_far_from_the_others_follows_its_own_score() -> None:
-    random = np.random.default_rng(0)
-    vectors, scores = np.zeros((2, 9)), random.standard_normal((2, 9))
-    vectors[1] = 0.5
-    np.testing.assert_array_equal(directions(vectors, scores), scores / 2.0)
-
-
-def test_particles_in_one_place_share_their_scores() -> None:
-    scores = np.arange(27.0).reshape(3, 9)
-    for median in (False, True):
-        phi = directions(np.ones((3, 9)), scores, median=median)
-        np.testing.assert_allclose(phi, np.tile(scores.mean(axis=0), (3, 1)), rtol=1e-14)
-
-
 @pytest.mark.parametrize("kernel", ["reference", "median"])
 def test_particles_move_as_torch_would_move_them(kernel: str) -> None:
     problem = posed(initial_set=around_truth(6, 0.02, 0.002))
