@@ -45,10 +45,6 @@ def _is_inside(mesh: trimesh.Trimesh, points: Sequence[Sequence[float]]) -> list
     return (winding > 0.5).tolist()
 
 
-def test_every_scan_has_a_model() -> None:
-    assert list(MODELS) == list(SCANS)
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_is_one_closed_body_of_the_scans_size(name: str) -> None:
     model = load_model(name)

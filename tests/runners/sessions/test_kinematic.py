@@ -12,10 +12,9 @@ from chsel.problem.sdf_grid import mesh_sdf
 from replay.events import Probe
 from runners.objects.loader import load_model
 from runners.sessions.configurations import CONFIGURATIONS
-from runners.sessions.free_space import box_shell
 from runners.sessions.gripper import START, X_REST
 from runners.sessions.kinematic import KinematicEngine
-from runners.sessions.probing import ProbingSession, open_probing
+from runners.sessions.probing import ProbingSession, box_shell, open_probing
 from runners.sessions.probing_hand import ROTATION, panda_hand
 from runners.sessions.probing_settings import ProbingSettings
 

@@ -184,13 +184,6 @@ def test_the_seed_chooses_among_contact_pixels_and_changes_nothing_else(
     assert not np.array_equal(other.contacts, first.contacts)
 
 
-def test_a_session_can_be_read_twice(log: Path) -> None:
-    session = open_log(log)
-    one, other = ([p.new_points.digest for p in probes(session.probes())] for _ in range(2))
-    assert one == other
-    assert session.report.total()["pad"].contacts == 50
-
-
 def test_contacts_count_between_begin_and_end_alone(tmp_path: Path) -> None:
     marks = ((0.5, "begin 3"), (1.2, "end 3"), (2.8, "begin 4"), (4.9, "end 4"))
     log = SphereLog(marks=marks).write(tmp_path / "log.mcap")
