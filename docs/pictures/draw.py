@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,11 @@ _PARTS = (0.4, 0.75, 1.0)  # of the hand's way to where it is deepest, a frame e
 _MOVING, _SHOWN, _QUICK, _LAST = 120, 600, 180, 4000  # milliseconds of a frame
 
 
+@cache
+def _surface(mesh: trimesh.Trimesh) -> FloatArray:
+    return surface_points(mesh, 12_000, StreamKey(0, 0))
+
+
 class View:
     """The part of the world that a panel shows: all points (N, 3), and 6 cm around them."""
 
@@ -78,7 +84,7 @@ class View:
         self, panel: Axes, mesh: Any, poses: Iterable[FloatArray], color: str, *, fill: bool = False
     ) -> None:
         """A mesh in poses (4, 4): its outline, that of the true pose dashed, or what is behind."""
-        points, side = surface_points(mesh, 12_000, StreamKey(0, 0)), self._half.max() / 80.0
+        points, side = _surface(mesh), self._half.max() / 80.0
         low, high = self._middle - self._half - 3 * side, self._middle + self._half + 3 * side
         edges = [np.arange(low[i], high[i], side) for i in (0, 1)]
         x, y = (some[:-1] + side / 2 for some in edges)

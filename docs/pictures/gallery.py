@@ -92,7 +92,7 @@ def viewer_on(folder: str, size: str) -> Iterator[int]:
     command = [str(viewer_program()), *options, "--window-size", size, rrd]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        while not asked(port, lambda client: client.get_state().recordings):
+        while (state := asked(port, ViewerClient.get_state)).loading or not state.recordings:
             time.sleep(0.5)
         time.sleep(_SETTLE)
         yield port

@@ -78,8 +78,7 @@ class ProbingSession:
 
         Raises SettingError if nothing of the hand is deep enough to sweep.
         """
-        self.configuration = configuration
-        self.settings = settings
+        self.configuration, self.settings = configuration, settings
         self.workspace = choose_workspace(configuration, settings)
         self.free_resolution = settings.free_resolution
         self.world_from_object: FloatArray | None = engine.world_from_object
@@ -97,8 +96,7 @@ class ProbingSession:
             )
         self._offered: Actions | None = None
         self._available = np.zeros(0, dtype=bool)
-        self._gripper = Gripper(engine, settings, seed)
-        self._engine = engine
+        self._engine, self._gripper = engine, Gripper(engine, settings, seed)
         self._faults: Faults | None = None
         if settings.faults != FaultSettings():
             probed, pose = probed_mesh(mesh, settings.faults), engine.world_from_object
@@ -169,12 +167,10 @@ class ProbingSession:
     def _boundary(self, mesh: trimesh.Trimesh, world_from_object: FloatArray) -> FloatArray:
         """Centres (N, 3) of the voxels where the object is known not to be."""
         lattice, chosen = self._voxels.lattice, self.settings.boundary
-        points = np.zeros((0, 3))
-        if chosen in ("box_shell", "both"):
-            points = np.concatenate([points, box_shell(lattice, self.workspace)])
-        if chosen in ("floor_slab", "both"):
-            vertices = apply(world_from_object, np.asarray(mesh.vertices))
-            points = np.concatenate([points, floor_slab(lattice, vertices)])
+        vertices = apply(world_from_object, np.asarray(mesh.vertices))
+        parts = {"box_shell": box_shell(lattice, self.workspace)}
+        parts["floor_slab"] = floor_slab(lattice, vertices)
+        points = np.concatenate([part for name, part in parts.items() if chosen in (name, "both")])
         # Some configurations reach out of their workspace; free points within the object would lie.
         return points[mesh_sdf(mesh, apply(inverse(world_from_object), points))[0] > 0.0]
 

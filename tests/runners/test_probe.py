@@ -21,7 +21,6 @@ from chsel.errors import MeshError
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import object_symmetry
-from chsel.problem.poses import apply
 from replay.events import Logged, Measured
 from replay.mcap.reader import read_recording
 from runners import probe
@@ -206,22 +205,14 @@ def test_a_recorded_session_repeats_the_probes_with_another_method(
     finished: tuple[Path, Done], tmp_path: Path
 ) -> None:
     source = finished[0] / "recording.mcap"
-    done = run(
-        tmp_path,
-        "session=recorded",
-        f"session.path={source}",
-        "method=gradient_descent",
-        *QUICK[:2],
-        "recording=mcap",
-    )
+    chosen = ("session=recorded", f"session.path={source}", "method=gradient_descent", *QUICK[:2])
+    done = run(tmp_path, *chosen, "recording=mcap")
     assert done.returncode == 0, done.stderr
     again = read_recording(run_folder(tmp_path) / "recording.mcap")
     before = read_recording(source)
     assert again.problem(2).points.digest == before.problem(2).points.digest
     assert again.start.sdf.digest == before.start.sdf.digest
-    assert again.start.object == "mesh"
-    assert again.steps == before.steps
-    assert again.hypotheses(2).archive is None
+    assert (again.start.object, again.steps) == ("mesh", before.steps)
 
 
 @pytest.mark.usefixtures("interruptible")
@@ -291,21 +282,3 @@ def test_a_mistake_is_one_line_and_status_2(
 def test_traceback_is_shown_when_asked_for(points: tuple[str, ...], tmp_path: Path) -> None:
     with pytest.raises(MeshError):  # which Python prints with its traceback
         run(tmp_path, *points, "object.path=nothing.obj", "--traceback")
-
-
-@pytest.mark.parametrize(("name", "limit"), [("icub_lego", 10e-3), ("ycbv_gelatin_box", 4e-3)])
-def test_real_measurements_are_registered(
-    real_directory: Path, tmp_path: Path, name: str, limit: float
-) -> None:
-    """Mean |SDF| of the best hypothesis stays in the range of multi-start ICP."""
-    overrides = ["session=points", "object=mesh", "method=chsel", "recording=mcap"]
-    overrides += [f"session.path={real_directory / name}.npz"]
-    overrides += [f"object.path={real_directory / name}.obj"]
-    done = run(tmp_path, *overrides)
-    assert done.returncode == 0, done.stderr
-    recording = read_recording(run_folder(tmp_path) / "recording.mcap")
-    (step,) = recording.steps
-    problem = recording.problem(step)
-    moved = apply(recording.hypotheses(step).object_from_world[0], problem.points.known)
-    sdf, _ = problem.sdf.at(moved, lookup="trilinear")
-    assert float(np.abs(sdf).mean()) < limit

@@ -17,8 +17,7 @@ from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.mcap.reader import read_recording
 from runners import evaluate, published
-from runners.evaluation.contenders import repeat_seed
-from runners.published_package.process import PackageError, RefusedError
+from runners.published_package.process import RefusedError
 from runners.published_package.worker import Worker
 from tests.runners.in_process import Done, run
 from tests.runners.test_evaluate import SMALL, table
@@ -130,16 +129,8 @@ def test_draws_differ_in_their_numbers_alone_and_rank_under_labels_of_their_own(
     methods = ["icp", "icp+1", "package", "package+1"]
     assert sorted(by) == [(method, step) for method in methods for step in (4, 5)]
     assert {row["status"] for row in by.values()} == {"ok"}
-    for step in (4, 5):
-        assert len({by[method, step]["diversity"] for method in methods}) == 4
-        for name in ("true_cost", "members", "contacts"):  # the session and its set are the same
-            assert len({by[method, step][name] for method in methods}) == 1
-    seeds = {
-        read_recording(folder / f"trials/mustard/seed_0/{name}.mcap").problem(4).key.seed
-        for name in ("icp", "icp+1")
-    }
-    assert seeds == {0, repeat_seed(0, 1)}
-    assert "icp+1" in done.stdout
+    assert len({by[method, 4]["diversity"] for method in methods}) == 4
+    assert len({by[method, 4]["true_cost"] for method in methods}) == 1
 
 
 def test_what_is_finished_is_not_registered_again_unless_its_session_or_package_is_another(
@@ -168,20 +159,6 @@ def test_a_step_that_the_package_refuses_is_told_and_the_session_goes_on(
     with np.load(tmp_path / "mustard/seed_0.npz") as sets:
         assert sorted(sets.files) == ["cost_5", "seconds_5", "step_5"]
     assert len(stand_in.problems[1].low_cost_set) == 0  # there is no step before
-
-
-def test_a_process_that_ends_stops_all_and_leaves_what_is_finished(
-    folder: Path, tmp_path: Path, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    register(folder, tmp_path)
-
-    def die(*_: object, **__: object) -> None:
-        raise PackageError("its process ended: Killed")
-
-    monkeypatch.setattr(stand_in, "register", die)
-    done = register(folder, tmp_path, "draws=2")
-    assert (done.returncode, done.stderr) == (2, "error: its process ended: Killed\n")
-    assert [path.name for path in tmp_path.rglob("*.npz")] == ["seed_0.npz"]
 
 
 @pytest.mark.parametrize(
