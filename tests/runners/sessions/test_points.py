@@ -70,15 +70,10 @@ def test_csv_holds_every_kind_and_points_without_a_step_are_known_first(tmp_path
     np.testing.assert_array_equal(first.free, [[0.1, 0.1, 0.7], [3, 3, 3]])
     np.testing.assert_array_equal(later.sdf, [-0.02])
     np.testing.assert_array_equal(later.occupied, [[2, 2, 2]])
-    content = read_points(text(tmp_path, "\ufeffx,y,z,kind\n0,0,0,surface\n"))
-    np.testing.assert_array_equal(content.at(0).known, [[0, 0, 0]])
-
-
-def test_numbers_of_csv_are_read_to_the_bit(tmp_path: Path) -> None:
     points = np.random.default_rng(0).normal(size=(500, 3)) * 10.0 ** np.arange(-3, 0)
-    rows = [f"{x!r},{y!r},{z!r},free" for x, y, z in points.tolist()]
-    content = read_points(text(tmp_path, "\n".join(["x,y,z,kind", *rows])))
-    np.testing.assert_array_equal(content.at(0).free, points)
+    lines = [f"{x!r},{y!r},{z!r},free" for x, y, z in points.tolist()]
+    content = read_points(text(tmp_path, "\n".join(["\ufeffx,y,z,kind", *lines])))
+    np.testing.assert_array_equal(content.at(0).free, points)  # to the bit
 
 
 @pytest.mark.parametrize("suffix", ["ply", "off", "stl", "xyz"])
@@ -100,13 +95,6 @@ def test_vertices_beside_the_faces_are_points_too(tmp_path: Path) -> None:
     assert sorted(found.tolist()) == expected
     with pytest.raises(PointsError, match=r"surface\[4\] is not finite"):
         read_points(text(tmp_path, off.format("nan"), "points.off"))
-
-
-def test_points_in_millimetres_are_refused(tmp_path: Path) -> None:
-    path = npz(tmp_path, surface=1000.0 * SURFACE, surface_step=np.arange(3))
-    message = r"points.npz: points on the object span 223.6 m, and the object is 0.13 m: are they"
-    with pytest.raises(PointsError, match=message):
-        PointsSession(PointsSettings(str(path)), BOX)
 
 
 @pytest.mark.parametrize(
