@@ -63,9 +63,7 @@ def stand_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ask = [str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]
     site = Path(subprocess.run(ask, capture_output=True, text=True, check=True).stdout.strip())
     (site / "numpy_and_torch.pth").write_text(f"{Path(torch.__file__).parents[1]}\n")
-    (site / "chsel").mkdir()
-    (site / "chsel" / "__init__.py").write_text(CHSEL)
-    (site / "chsel" / "sgd.py").write_text(SGD)
+    (site / "chsel.py").write_text(CHSEL)
     (site / "pytorch_volumetric.py").write_text(VOLUMETRIC)
     for name in ("chsel", "pytorch_volumetric", "pytorch_kinematics", "ribs"):
         (site / f"{name}-0.2.1.dist-info").mkdir()
@@ -77,7 +75,17 @@ def stand_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
 CHSEL = """
 import enum, types
 import torch
-from chsel import sgd
+
+def volumetric_registration_sgd(
+    cost, R, T, max_iterations=10, relative_rmse_thr=1e-6, iterations=50
+):
+    for _ in range(max_iterations):
+        for _ in range(iterations):
+            cost(R.clone().requires_grad_(), T, None)
+        if 0.0 <= relative_rmse_thr:  # this descent gains nothing
+            break
+
+sgd = types.SimpleNamespace(volumetric_registration_sgd=volumetric_registration_sgd)
 
 class SemanticsClass(enum.IntEnum):
     SURFACE = 0
@@ -124,16 +132,6 @@ class PositionMeasure:
         return torch.eye(3).repeat(len(x), 1, 1), torch.tensor(x)
 
 measure = types.SimpleNamespace(PositionMeasure=PositionMeasure)
-"""
-SGD = """
-def volumetric_registration_sgd(
-    cost, R, T, max_iterations=10, relative_rmse_thr=1e-6, iterations=50
-):
-    for _ in range(max_iterations):
-        for _ in range(iterations):
-            cost(R.clone().requires_grad_(), T, None)
-        if 0.0 <= relative_rmse_thr:  # this descent gains nothing
-            break
 """
 VOLUMETRIC = """
 class CachedSDF:

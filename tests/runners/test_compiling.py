@@ -72,13 +72,7 @@ def points(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
 
 @pytest.mark.parametrize(
     "choice",
-    [
-        ("method=chsel", *QUICK),
-        ("method=icp",),
-        ("method=cvo", "preset=reference"),
-        ("method=medial_constraint", "preset=reference"),
-        ("method=anchored",),
-    ],
+    [("method=chsel", *QUICK), ("method=cvo", "preset=reference"), ("method=anchored",)],
     ids=lambda choice: choice[0],
 )
 def test_a_session_needs_no_kernel_that_is_not_there_before_its_first_probe(
