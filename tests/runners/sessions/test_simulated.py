@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -130,11 +130,10 @@ def test_a_seed_gives_the_same_bytes_in_every_process() -> None:
 
 
 def test_contacts_can_be_with_the_convex_parts(capfd: pytest.CaptureFixture[str]) -> None:
-    settings = replace(ProbingSettings(), collision_mesh="vhacd")
+    settings = ProbingSettings(collision_mesh="vhacd")
     session = open_probing("simulated", _mesh("can"), "can", settings, 0)
-    probe = next(session.probes())
+    assert len(next(session.probes()).contacts) >= 1
     session.close()
-    assert len(probe.contacts) >= 1
     assert capfd.readouterr().out == ""  # the decomposition is talkative
 
 
