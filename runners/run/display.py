@@ -170,7 +170,7 @@ class Display:
             if any(counts[field] for counts in total.values())
         }
         if total:
-            title = "sensors: messages, pixels or points left out, contacts and free voxels found"
+            title = "sensors, over all probes; left out: pixels or points"
             table = plain_table(title, texts=["sensor"], numbers=list(columns))
             for name, counts in total.items():
                 table.add_row(name, *(str(counts[field] or "") for field in columns.values()))
