@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
@@ -18,9 +19,7 @@ from chsel.problem.streams import StreamKey
 from replay.console import Console
 from replay.environment import environment
 from runners.benchmarks import benchmark_report
-from runners.benchmarks.measures import MEASURES, Scope
-from runners.benchmarks.registrations import PROBLEMS, compare
-from runners.benchmarks.timing import Row, Steps, cores, load
+from runners.benchmarks.registrations import MEASURES, PROBLEMS, Row, Scope, Steps, compare
 from runners.command.program import command, plain
 from runners.published_package.process import PackageConfig, PublishedPackage, interpreter
 from runners.run.recording import make_run_folder, write_in_run_folder
@@ -60,7 +59,7 @@ class BenchmarkConfig:
         return replace(
             self,
             problems=("real_20",),
-            alone=tuple(name for name in self.alone if name not in ("methods", "pd_over_time")),
+            alone=tuple(name for name in self.alone if name != "methods"),
             repeats=2,
             package=replace(self.package, equation=()),
             steps=Steps(restarts=1, adam=50, search=10, long_search=20),
@@ -83,8 +82,9 @@ def main(config: DictConfig) -> None:
             package = stack.enter_context(PublishedPackage(python))
         folder = make_run_folder(Path(checked.logs) / "benchmark", "drill")
         write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
-        machine: dict[str, Any] = {**environment(), **cores()}
-        machine |= {"load_before": load(), "load_after": load()}
+        # Processes that ran or waited on average over the last minute.
+        busy = {"cores": os.cpu_count(), "load": os.getloadavg()[0]}
+        machine: dict[str, Any] = {**environment(), **busy}
         if package is not None:
             machine["published"] = package.versions
         about: dict[str, Any] = {"settings": asdict(checked), "machine": machine}
@@ -94,7 +94,6 @@ def main(config: DictConfig) -> None:
                 status.update(f"measuring {name}")
                 for row in measured:
                     rows.append(row)
-                    machine["load_after"] = load()
                     benchmark_report.write(folder, rows, about)
     for line in benchmark_report.page(rows, about):
         console.print(line)
@@ -106,12 +105,11 @@ def _measures(
     config: BenchmarkConfig, package: PublishedPackage | None
 ) -> Iterator[tuple[str, Iterator[Row]]]:
     """What is to be measured, by name; rows are measured as they are taken."""
+    scope = Scope(config.steps, config.repeats, config.seed)
     for name in config.problems:
-        equation = name in config.package.equation
-        more = config.steps, config.repeats, config.seed, package
-        yield name, compare(name, *more, equation=equation)
+        yield name, compare(name, scope, package, equation=name in config.package.equation)
     for name in config.alone:
-        yield name, MEASURES[name](Scope(config.steps, config.repeats, config.seed))
+        yield name, MEASURES[name](scope)
 
 
 if __name__ == "__main__":

@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
+import json
+import signal
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext, suppress
+from dataclasses import asdict
 from pathlib import Path
+from types import FrameType
+from typing import Self
 
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from chsel.errors import RecordingError
 from chsel.methods import build_method
+from chsel.methods.method import Method
 from chsel.numerics.compiler import watched
 from chsel.numerics.threads import set_threads
 from chsel.problem.settings import build_settings
 from chsel.rehearsal import warm_up, warm_up_policy, warm_up_sensing
+from replay.console import Console
+from replay.events import Logged, Recorder, SessionEnded, SessionStarted
+from replay.files import WritingError, file_digest
+from replay.registration import symmetry_for_errors
 from runners.command.choices import calls_for_anchored
 from runners.command.program import command, plain
-from runners.run.display import Display, compiling_line, reading_bar
-from runners.run.probe_run import Interrupt, run
-from runners.run.recording import make_run_folder, write_in_run_folder
-from runners.run.scene import ProbeConfig, open_scene, session_started
+from runners.run.display import Display, compiling_line
+from runners.run.recording import make_run_folder, open_recorder, write_in_run_folder
+from runners.run.scene import ProbeConfig, Scene, open_scene, session_started
+from runners.run.session_run import Row, SessionRun
 
 
 @command("probe")
@@ -28,23 +39,25 @@ def main(config: DictConfig) -> None:
     """Run one session."""
     values = plain(config)
     checked = build_settings(ProbeConfig, values, "probe")
-    display = Display(f"{_title(checked)}, preset {checked.preset.name}, seed {checked.seed}")
-    if why := _default_because():
-        name = checked.method["name"]
-        display.say(f"method={name} (the default for {why}; method=chsel is the paper's)")
-    set_threads(checked.threads)
-    method_config = dict(checked.method)
+    method_config, kind = dict(checked.method), checked.session.get("kind")
     method_name = str(method_config.pop("name", None))
+    title = f"{kind} session, {method_name}, preset {checked.preset.name}, seed {checked.seed}"
+    if kind != "recorded":  # whose object is known once it is read
+        title = f"{checked.object.name}, {title}"
+    display = Display(title)
+    if why := _default_because():
+        display.say(f"method={method_name} (the default for {why}; method=chsel is the paper's)")
+    set_threads(checked.threads)
     method = build_method(method_name, method_config)
     with ExitStack() as stack:
-        with reading_bar() as bar, watched(lambda _: None):  # it compiles next to nothing
-            scene = open_scene(checked, bar.show)
+        with Console().status("opening the session"), watched(lambda _: None):
+            scene = open_scene(checked)
         stack.callback(scene.session.close)
         with compiling_line():
             warm_up(method)
             if scene.steering is not None:
                 warm_up_policy(scene.steering.policy)
-            if checked.session["kind"] == "sensors":
+            if kind == "sensors":
                 warm_up_sensing()
         folder = make_run_folder(Path(checked.logs) / "probe", scene.object_name, method_name)
         write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
@@ -55,13 +68,6 @@ def main(config: DictConfig) -> None:
         sys.exit(130)
 
 
-def _title(config: ProbeConfig) -> str:
-    """What is run; the object of a recorded session is known once it is read."""
-    kind = str(config.session.get("kind"))
-    session = f"{kind} session, {config.method.get('name')}"
-    return session if kind == "recorded" else f"{config.object.name}, {session}"
-
-
 def _default_because() -> str:
     """The choice that `anchored` is the default for, if it was taken as such; else ""."""
     chosen = HydraConfig.get()
@@ -69,6 +75,141 @@ def _default_because() -> str:
     if choices["method"] == "chsel" or any(w.startswith("method=") for w in chosen.overrides.task):
         return ""
     return calls_for_anchored(choices["session"], choices["policy"])
+
+
+class Interrupt:
+    """Within this context the first Ctrl-C is remembered, and the second takes effect at once."""
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._previous = signal.getsignal(signal.SIGINT)
+
+    def __enter__(self) -> Self:
+        signal.signal(signal.SIGINT, self._remember)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGINT, self._previous)
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if Ctrl-C was pressed."""
+        if self._asked:
+            raise KeyboardInterrupt
+
+    def _remember(self, _: int, __: FrameType | None) -> None:
+        self.check()
+        self._asked = True
+
+
+def run(
+    folder: Path,
+    config: ProbeConfig,
+    method: Method,
+    scene: Scene,
+    started: SessionStarted,
+    interrupt: Interrupt,
+    display: Display,
+) -> bool:
+    """Run the session to its end or to Ctrl-C; whether it was interrupted."""
+    if started.session == "recorded":
+        display.say(f"object: {started.object}")
+    steering = scene.steering
+    display.probes(scene.session.count if steering is None else steering.policy.settings.probes)
+    recorder = open_recorder(folder, config.recording)
+    session_run = SessionRun(
+        scene.session,
+        scene.online(method.online, config.seed),
+        method,
+        recorder,
+        symmetry=symmetry_for_errors(started),
+        recording=config.recording,
+        show=lambda *_: interrupt.check(),
+        opening=scene.warnings,
+        steering=steering,
+    )
+    display.warn(scene.warnings)
+    rows: list[Row] = []
+    outcome = "finished"
+    try:
+        try:
+            recorder.record(started)
+            recorder.flush()
+            for _, row in session_run.steps():
+                rows.append(row)
+                display.probe(row)
+                display.warn(session_run.warnings)
+                interrupt.check()
+            display.warn(session_run.warnings)
+        except KeyboardInterrupt:
+            outcome = "interrupted"
+        except SystemExit:  # the reader of the output has closed it
+            outcome = "interrupted"
+            raise
+        except Exception as error:
+            outcome = f"failed: {error}"
+            raise
+        finally:
+            with _first_error_alone(outcome):
+                _end(recorder, session_run.step, outcome)
+    except RecordingError as error:
+        outcome = f"failed: {error}"
+        raise
+    finally:
+        with _first_error_alone(outcome):
+            _summarise(folder, scene, started, session_run, rows, outcome)
+    if scene.report is not None:
+        display.sensed(scene.report)
+    display.table(rows)
+    if outcome == "interrupted":
+        display.say("interrupted: the recording holds everything up to here")
+    if steering is not None:
+        display.stopped(steering)
+    display.written(folder)
+    display.pose(rows)
+    display.verdict(session_run.trust)
+    return outcome == "interrupted"
+
+
+def _first_error_alone(outcome: str) -> suppress | nullcontext[None]:
+    """Where a run has failed or was interrupted, what cannot be written then is not reported."""
+    if outcome == "finished":
+        return nullcontext()
+    return suppress(OSError, RecordingError, WritingError)
+
+
+def _end(recorder: Recorder, step: int, outcome: str) -> None:
+    """End the recording."""
+    level = "info" if outcome == "finished" else "warning"
+    try:
+        recorder.record(Logged(step, level, f"session {outcome}"))
+        recorder.record(SessionEnded(step, outcome))
+    finally:
+        recorder.close()
+
+
+def _summarise(
+    folder: Path,
+    scene: Scene,
+    started: SessionStarted,
+    session_run: SessionRun,
+    rows: list[Row],
+    outcome: str,
+) -> None:
+    """Write the outcome, warnings, and the numbers of every step, times included."""
+    trust, recording = session_run.trust, folder / "recording.mcap"
+    sensors = scene.report.total().items() if scene.report else ()
+    names = ("runner", "object", "session", "method", "seed")
+    summary = {
+        **{name: getattr(started, name) for name in names},
+        "outcome": outcome,
+        "recording_digest": file_digest(recording) if recording.is_file() else None,
+        "trust": None if trust is None else asdict(trust),  # of the last result
+        "warnings": [asdict(warning) for warning in session_run.warnings],
+        "sensors": {name: asdict(counts) for name, counts in sensors},
+        "steps": rows,
+        "environment": dict(started.environment),
+    }
+    write_in_run_folder(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
 
 
 if __name__ == "__main__":

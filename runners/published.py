@@ -2,24 +2,44 @@
 
 from __future__ import annotations
 
+import json
 import sys
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import trimesh
 from omegaconf import DictConfig
 
-from chsel.errors import SettingError
-from chsel.problem.settings import build_settings
+from chsel.errors import PoseError, SettingError
+from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.poses import Poses, inverse, nearest_rigid
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.settings import build_settings, in_preset
+from chsel.problem.streams import Purpose
+from chsel.qd.selection import repeated
 from replay.console import Console, Progress
+from replay.files import file_digest, whole_file
 from runners.command.program import command, plain
-from runners.evaluation.contenders import require_repeats
+from runners.evaluation.contenders import repeat_label, repeat_seed, require_repeats
 from runners.evaluation.experiment import read_experiment
-from runners.evaluation.plan import Trial
+from runners.evaluation.external_results import REPEAT_FOLDER
+from runners.evaluation.plan import Task, Trial
 from runners.evaluation.trial_configurations import chosen_names, chosen_seeds
 from runners.evaluation.trial_session import read_told
-from runners.published_package.package_session import PackageSession
-from runners.published_package.process import PackageConfig, PublishedPackage, interpreter
+from runners.published_package.process import (
+    PackageConfig,
+    PublishedPackage,
+    RefusedError,
+    interpreter,
+)
+from runners.sessions.recorded import RecordedSession, RecordedSettings
+
+HOW = replace(in_preset(OnlineSettings(), "reference"), initial="so3")
+"""E_0 and E_l as the package's authors make them, but first from the starts that all others get."""
 
 
 @dataclass(frozen=True)
@@ -90,17 +110,110 @@ def found_trials(config: PublishedConfig) -> list[tuple[Trial, Path]]:
     experiment = read_experiment(folder)
     names = chosen_names("configurations", config.configurations, experiment["configurations"])
     seeds = experiment["seeds"] if config.seeds is None else chosen_seeds(config.seeds)
-    found = []
-    for trial in sorted(Trial(seed, name) for seed in seeds for name in names):
-        session = folder / "trials" / trial.configuration / f"seed_{trial.seed}" / "session.mcap"
-        if session.is_file() and session.with_suffix(".json").is_file():
-            found.append((trial, session))
+    trials = sorted(Trial(seed, name) for seed in seeds for name in names)
+    place = "trials/{0.configuration}/seed_{0.seed}/session.mcap"
+    paths = [(trial, folder / place.format(trial)) for trial in trials]
+    found = [(trial, path) for trial, path in paths if path.with_suffix(".json").is_file()]
     if not found:
         raise SettingError(
             f"configurations={config.configurations} and seeds={config.seeds} name no session; "
             f"accepted: {', '.join(names)}; seeds {', '.join(map(str, experiment['seeds']))}"
         )
     return found
+
+
+@dataclass(frozen=True)
+class PackageSession:
+    """One draw of a trial: what registers it, and the files of what is found, in a folder of sets.
+
+    session: the trial's recording. steps: those to register.
+    """
+
+    package: PublishedPackage
+    folder: Path
+    trial: Trial
+    draw: int
+    session: Path
+    steps: tuple[int, ...]
+
+    @property
+    def unit(self) -> Task:
+        """As progress names it."""
+        return Task(self.trial, repeat_label("package", self.draw))
+
+    @property
+    def sets(self) -> Path:
+        """The hypotheses, as runners.evaluate takes them."""
+        of_draw = self.folder / REPEAT_FOLDER.format(self.draw) if self.draw else self.folder
+        return of_draw / self.trial.configuration / f"seed_{self.trial.seed}.npz"
+
+    @property
+    def about(self) -> Path:
+        """How the sets came about, and why steps have none; written last."""
+        return self.sets.with_suffix(".about.json")
+
+    def failures(self) -> Mapping[str, str] | None:
+        """Why steps have no set; None if the sets are not there, or of another session or version.
+
+        A file that cannot be read is made again.
+        """
+        with suppress(OSError, ValueError):
+            about = json.loads(self.about.read_text())
+            if self.sets.is_file() and self._source().items() <= about.items():
+                return dict(about["failed"])
+        return None
+
+    def register(self) -> Iterator[int]:
+        """Yields each step when the package is done with it; the files are there at the end."""
+        session = RecordedSession(RecordedSettings(str(self.session), 0, 0))
+        arrays: dict[str, Any] = {}
+        about: dict[str, Any] = {"failed": {}, "cpu_seconds": {}, "free_points": {}}
+
+        def register(problem: RegistrationProblem) -> Hypotheses:
+            found, answer = registered(self.package, problem, session.recorded.mesh)
+            step = problem.key.step
+            arrays[f"step_{step}"] = inverse(found.object_from_world)
+            arrays[f"cost_{step}"] = found.cost
+            arrays[f"seconds_{step}"] = np.array(answer["seconds"])
+            for name in ("cpu_seconds", "free_points"):
+                about[name][str(step)] = answer[name]
+            return found
+
+        online = session.online(HOW, repeat_seed(self.trial.seed, self.draw), only=self.steps)
+        for step in online.steps(session.perceived(), register, (RefusedError, PoseError)):
+            if step.failure is not None:
+                about["failed"][str(step.step)] = " ".join(str(step.failure).split())
+            yield step.step
+        with whole_file(self.sets) as beside, beside.open("wb") as file:
+            np.savez(file, **arrays)
+        with whole_file(self.about) as beside:
+            beside.write_text(json.dumps({**self._source(), **about}, indent=2) + "\n")
+
+    def _source(self) -> dict[str, Any]:
+        return {
+            "session": file_digest(self.session),
+            "steps": list(self.steps),
+            "draw": self.draw,
+            "versions": dict(self.package.versions),
+        }
+
+
+def registered(
+    package: PublishedPackage, problem: RegistrationProblem, mesh: trimesh.Trimesh
+) -> tuple[Hypotheses, Mapping[str, Any]]:
+    """What the package finds with its own settings, best first, and its whole answer."""
+    package.load(problem, mesh.bounds)
+    # It draws from generators of its own, of one number that follows from ours.
+    seed = int(problem.key.stream(Purpose.EMITTER).integers(2**32))
+    answer = package.register(seed=seed)
+    poses = nearest_rigid("a pose of the package", np.array(answer["poses"]))
+    elites = nearest_rigid("an elite of the package", np.array(answer["elites"]))
+    cost = np.array(answer["cost"], dtype=np.float64)
+    if not np.isfinite(cost).all():
+        raise RefusedError("a cost of the package is not finite")
+    order = np.argsort(cost, kind="stable")
+    poses, cells = poses[order], np.full(len(poses), -1, dtype=np.int64)
+    return Hypotheses(poses, cost[order], repeated(Poses.of(poses)), cells, elites), answer
 
 
 if __name__ == "__main__":

@@ -49,7 +49,7 @@ MAY_IMPORT = {
         "run": {"objects", "sensors", "sessions"},
         "command": {"objects", "sensors", "sessions", "run"},
         "evaluation": {"objects", "sensors", "sessions", "simulated_robot", "command", "run"},
-        "published_package": {"sessions", "command", "evaluation"},
+        "published_package": {"command"},
         "reporting": {"objects", "sessions", "evaluation"},
         "benchmarks": {
             "objects",

@@ -1,121 +1,157 @@
-"""`python -m docs.pictures.gallery [NAME ...]`: pictures of README and docs, with their sessions.
+"""`python -m docs.pictures.gallery [FILE ...]`: pictures of README and docs, with their sessions.
 
-Needs PyBullet (Python 3.11) and what docs.pictures.screenshot needs. Figures of docs/results are
-from `python -m runners.report` and `python -m docs.pictures.sequence`.
+Run from the repository's root. Needs PyBullet (Python 3.11) and Vulkan: a graphics card's, or the
+software one (Debian: mesa-vulkan-drivers). Figures of docs/results are from `python -m
+runners.report` and `python -m docs.pictures.draw sequence`.
 """
 
 from __future__ import annotations
 
+import io
 import shlex
 import subprocess
 import sys
 import tempfile
+import time
+from collections import ChainMap
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from PIL import Image, ImageDraw, ImageFont
+from rerun.experimental import ViewerClient
 
-from docs.pictures.animation import webp
-from docs.pictures.screenshot import screenshot, viewer_on
+from docs.pictures.draw import small_png, webp
 from replay.mcap.reader import read_recording
+from replay.rerun.viewer import free_port, viewer_program, viewer_url
 
-_FAULTS = "clean noise_3mm quantised_5mm foreign_10 free_wrong camera_5mm mesh_2pct mixed"
-_KINEMATIC = "object=drill session=kinematic method=anchored"
-_STEERED = f"{_KINEMATIC} policy=information policy.stop.spread=0.005"
-_ROBOT = "session=sensors session/rig=cabinet object=drill object.scale=1"
+_LEVELS = ("clean", "noise_3mm", "quantised_5mm", "foreign_10")
+_LEVELS += ("free_wrong", "camera_5mm", "mesh_2pct", "mixed")
+_DRILL = "runners.probe logs={here} object=drill"
+_FAULTY = "runners.probe logs={here} object=mustard session=kinematic method=anchored seed=2"
+_MAKES = {  # what pictures are made of: the folder {here}, or that of the session in it
+    "drill": f"{_DRILL} method=chsel",
+    "anchored": f"{_DRILL} session=kinematic",
+    "grid": f"{_DRILL} session=kinematic method=anchored session.start_contacts=1 "
+    "session.start_probe=0",
+    "steered": f"{_DRILL} session=kinematic policy=information policy.stop.spread=0.005",
+    "log": "runners.simulate_rig configuration=cabinet_drill out={here}/drill.mcap",
+    "robot": f"{_DRILL} object.scale=1 session=sensors session/rig=cabinet "
+    "session.path={log}/drill.mcap session.pose={log}/drill.truth.yaml",
+    "compared": "replay compare {drill}/recording.mcap --methods gradient_descent "
+    "--save-rerun {here}/recording.rrd",
+    **{one: f"{_FAULTY} session.start_probe=10 session/faults={one}" for one in _LEVELS},
+}
+_DRAWN = {
+    "docs/anchored.png": "stages docs/anchored.png {anchored}/recording.mcap",
+    "docs/next_probe.webp": "animation docs/next_probe.webp grid={grid}/recording.mcap "
+    "information={steered}/recording.mcap",
+    **{
+        f"docs/real_data/{one}.png": f"faults docs/real_data/{one}.png {{{one}}}/recording.mcap"
+        for one in _LEVELS
+    },
+}
+_SHOWN = {  # by the viewer, at a probe
+    "replay/recording.png": ("drill", 4),
+    "replay/comparison.png": ("compared", 4),
+    "docs/robot_log.png": ("robot", 1),
+    "docs/next_probe.png": ("steered", 2),
+}
+_LIMIT = 120.0  # seconds for one answer
+_SETTLE = 8.0  # seconds until the viewer's layout stands and the notice of the start is gone
+_MENU = 37  # height of the viewer's menu bar: about the machine, not the recording
 
 
-class Sessions:
-    """Runs sessions in a folder, each once."""
+class _Made(dict[str, str]):
+    """The folders of what was made, each when it is first asked for."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: str) -> None:
+        self._folder = Path(folder)
 
-    def run(self, name: str, choices: str) -> Path:
-        """The folder that a session has written."""
-        logs = self.folder / name
-        if not logs.exists():
-            _run(f"runners.probe {choices} logs={logs}")
-        (written,) = (logs / "probe").iterdir()
-        return written
-
-    def drill(self) -> Path:
-        """That of the session that README starts with."""
-        return self.run("drill", "object=drill method=chsel")
+    def __missing__(self, name: str) -> str:
+        here = self._folder / name
+        here.mkdir()
+        run(_MAKES[name].format_map(ChainMap({"here": str(here)}, self)))
+        self[name] = str(next(here.glob("probe/*"), here))
+        return self[name]
 
 
-def _run(command: str) -> None:
+def run(command: str) -> None:
+    """Run a module with its arguments."""
     print("python -m", command)
-    subprocess.run(
-        [sys.executable, "-m", *shlex.split(command)], check=True, stdout=subprocess.DEVNULL
-    )
+    words = [sys.executable, "-m", *shlex.split(command)]
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
 
 
-def recording(sessions: Sessions) -> None:
-    """The viewer on a session."""
-    screenshot(sessions.drill() / "recording.rrd", Path("replay/recording.png"), step=4)
+@contextmanager
+def viewer_on(folder: str, size: str) -> Iterator[int]:
+    """The port of a viewer without a screen that has read the recording in a folder."""
+    port, rrd = free_port(), f"{folder}/recording.rrd"
+    options = ["--headless", "--hide-welcome-screen", "--bind", "127.0.0.1", "--port", str(port)]
+    command = [str(viewer_program()), *options, "--window-size", size, rrd]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        while (state := asked(port, ViewerClient.get_state)).loading or not state.recordings:
+            time.sleep(0.5)
+        time.sleep(_SETTLE)
+        yield port
+    finally:
+        process.kill()
+        process.wait()
 
 
-def session(sessions: Sessions) -> None:
-    """The scene of the same session, probe by probe."""
-    probes = read_recording(sessions.drill() / "recording.mcap").probes
-    frames, contacts = [], 0
-    with viewer_on(sessions.drill() / "recording.rrd", 1920, 1200) as viewer:
-        for probe in probes:
+def asked(port: int, question: Callable[[ViewerClient], Any]) -> Any:
+    """Ask again until there is an answer: a busy viewer gives none in its own time."""
+    deadline = time.monotonic() + _LIMIT
+    while True:
+        try:
+            return question(ViewerClient.connect(viewer_url(port)))
+        except (RuntimeError, OSError, ValueError):
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.5)
+
+
+def picture(port: int, step: int, **shown: Any) -> Image.Image:
+    """What is shown at a probe, as soon as nothing changes any more."""
+    asked(port, lambda client: client.set_time("probe", sequence=step, play_state="paused"))
+    last, png = b"", asked(port, lambda client: client.take_screenshot(**shown))
+    while png != last:
+        last, png = png, asked(port, lambda client: client.take_screenshot(**shown))
+    return Image.open(io.BytesIO(png)).convert("RGB")
+
+
+def session(folder: str, path: str) -> None:
+    """The scene of a session, probe by probe."""
+    frames, contacts, font = [], 0, ImageFont.load_default(22.0)
+    with viewer_on(folder, "1920x1200") as port:
+        views = asked(port, lambda client: client.get_state().views)
+        (scene,) = [view.view_id for view in views if view.name == "Scene"]
+        for probe in read_recording(f"{folder}/recording.mcap").probes:
             contacts += len(probe.contacts)
-            frame = viewer.picture(probe.step, "Scene")
+            frame = picture(port, probe.step, view_id=scene)
             text = f"probe {probe.step}: {contacts} contacts"
-            font = ImageFont.load_default(22.0)
-            ImageDraw.Draw(frame).text((16, 12), text, fill=(230, 232, 236), font=font)
+            ImageDraw.Draw(frame).text((16, 12), text, fill="#e6e8ec", font=font)
             size = 720, round(frame.height * 720 / frame.width)
             frames.append(frame.resize(size, Image.Resampling.LANCZOS))
-    webp(frames, [400] * (len(frames) - 1) + [2500], Path("replay/session.webp"))
-
-
-def comparison(sessions: Sessions) -> None:
-    """Another method on the problems of the same session."""
-    rrd, file = sessions.folder / "comparison.rrd", sessions.drill() / "recording.mcap"
-    _run(f"replay compare {file} --methods gradient_descent --save-rerun {rrd}")
-    screenshot(rrd, Path("replay/comparison.png"), step=4)
-
-
-def anchored(sessions: Sessions) -> None:
-    """The stages of method=anchored."""
-    folder = sessions.run("anchored", "object=drill session=kinematic recording=mcap")
-    _run(f"docs.pictures.anchored_stages {folder / 'recording.mcap'} docs/anchored.png")
-
-
-def real_data(sessions: Sessions) -> None:
-    """What method=anchored makes of contacts with faults."""
-    _run(f"docs.pictures.faults docs/real_data {_FAULTS}")
-
-
-def robot_log(sessions: Sessions) -> None:
-    """The viewer on the log of a simulated robot."""
-    log = sessions.folder / "drill.mcap"
-    _run(f"runners.simulate_rig configuration=cabinet_drill out={log}")
-    files = f"session.path={log} session.pose={log.with_suffix('.truth.yaml')}"
-    folder = sessions.run("robot_log", f"{_ROBOT} {files}")
-    screenshot(folder / "recording.rrd", Path("docs/robot_log.png"), step=1)
-
-
-def next_probe(sessions: Sessions) -> None:
-    """A drill found on the paper's grid and by information, and the viewer at a decision."""
-    grid = sessions.run("grid", f"{_KINEMATIC} session.start_contacts=1 session.start_probe=0")
-    steered = sessions.run("information", _STEERED)
-    named = f"grid={grid / 'recording.mcap'} information={steered / 'recording.mcap'}"
-    _run(f"docs.pictures.animation docs/next_probe.webp {named}")
-    screenshot(steered / "recording.rrd", Path("docs/next_probe.png"), step=2)
-
-
-PICTURES = (recording, session, comparison, anchored, real_data, robot_log, next_probe)
+    webp(frames, [400] * (len(frames) - 1) + [2500], path)
 
 
 def main(*names: str) -> None:
-    """Make all pictures, or those that are named, from the repository's root."""
+    """Make all pictures, or the files that are named."""
     with tempfile.TemporaryDirectory(prefix="gallery-") as folder:
-        for picture in PICTURES:
-            if not names or picture.__name__ in names:
-                picture(Sessions(Path(folder)))
+        made = _Made(folder)
+        for path in names or ("replay/session.webp", *_DRAWN, *_SHOWN):
+            if path in _DRAWN:
+                run(f"docs.pictures.draw {_DRAWN[path].format_map(made)}")
+            elif path in _SHOWN:
+                name, step = _SHOWN[path]
+                with viewer_on(made[name], "1600x900") as port:
+                    whole = picture(port, step)
+                small_png(whole.crop((0, _MENU, *whole.size)), path)
+            else:
+                session(made["drill"], path)
 
 
 if __name__ == "__main__":

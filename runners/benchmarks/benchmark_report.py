@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from runners.benchmarks.registrations import PACKAGE, WHAT
-from runners.benchmarks.timing import Row
+from runners.benchmarks.registrations import PACKAGE, WHAT, Row
 from runners.reporting.tables import number
 from runners.run.recording import write_in_run_folder
 
@@ -26,7 +25,13 @@ def write(folder: Path, rows: Sequence[Row], about: Mapping[str, Any]) -> None:
 
 def page(rows: Sequence[Row], about: Mapping[str, Any]) -> list[str]:
     """The tables in Markdown, which a terminal shows as well."""
-    lines = list(_machine(about["machine"]))
+    machine = about["machine"]
+    versions = [f"{name} {machine[f'package {name}']}" for name in _VERSIONS]
+    lines = [f"{machine['processor']}, {machine['cores']} cores, load {machine['load']:.2f}", ""]
+    lines += [", ".join([f"Python {machine['python']}", *versions]), ""]
+    if "published" in machine:
+        published = ", ".join(f"{name} {value}" for name, value in machine["published"].items())
+        lines += [f"package: {published}", ""]
     compared = [row for row in rows if row.measure == _COMPARED]
     if compared:
         lines += [WHAT, "", "One registration in ms; x: how many times as long the package takes"]
@@ -35,7 +40,12 @@ def page(rows: Sequence[Row], about: Mapping[str, Any]) -> list[str]:
     alone = [row for row in rows if row.measure != _COMPARED]
     if alone:
         lines += ["This library alone: median and quartiles", ""]
-        lines += [*_table([_cells(row) for row in alone]), ""]
+        cells = [
+            {"measure": row.measure, "case": row.case, "method": row.who, **_numbers(row)}
+            | {"unit": row.unit}
+            for row in alone
+        ]
+        lines += [*_table(cells), ""]
     return lines
 
 
@@ -47,26 +57,11 @@ def slower(rows: Sequence[Row], row: Row, package: str) -> float | None:
     return beside[0].median / row.median
 
 
-def _machine(machine: Mapping[str, Any]) -> Iterator[str]:
-    yield (
-        f"{machine['processor']}, {machine['cores_usable']} of {machine['cores']} cores usable, "
-        f"load {machine['load_before']} before, {machine['load_after']} after"
-    )
-    yield ""
-    versions = [f"{name} {machine[f'package {name}']}" for name in _VERSIONS]
-    yield ", ".join([f"Python {machine['python']}", *versions])
-    yield ""
-    if "published" in machine:
-        published = ", ".join(f"{name} {value}" for name, value in machine["published"].items())
-        yield from (f"package: {published}", "")
-
-
 def _comparison(rows: Sequence[Row]) -> list[dict[str, str]]:
     packages = [who for who in dict.fromkeys(row.who for row in rows) if who.startswith(PACKAGE)]
     lines = []
     for row in rows:
-        line = {"problem": row.case, "registration": row.who}
-        line |= {"median": number(row.median), "quartiles": _quartiles(row)}
+        line = {"problem": row.case, "registration": row.who, **_numbers(row)}
         for package in packages:
             ratio = slower(rows, row, package)
             heading = package.replace(PACKAGE, "x").replace(",", "")
@@ -75,14 +70,9 @@ def _comparison(rows: Sequence[Row]) -> list[dict[str, str]]:
     return lines
 
 
-def _cells(row: Row) -> dict[str, str]:
-    about = {"measure": row.measure, "case": row.case, "method": row.who}
-    numbers = {"median": number(row.median), "quartiles": _quartiles(row), "unit": row.unit}
-    return about | numbers
-
-
-def _quartiles(row: Row) -> str:
-    return "-".join(map(number, row.quartiles)) if len(row.samples) > 1 else ""
+def _numbers(row: Row) -> dict[str, str]:
+    quartiles = "-".join(map(number, row.quartiles)) if len(row.samples) > 1 else ""
+    return {"median": number(row.median), "quartiles": quartiles}
 
 
 def _table(lines: Sequence[Mapping[str, str]]) -> list[str]:

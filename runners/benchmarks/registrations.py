@@ -1,12 +1,13 @@
-"""Registrations by this library and by the published package, of the same problems."""
+"""What is timed: registrations by this library and by the published package, and other calls."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import trimesh
@@ -14,28 +15,103 @@ import trimesh
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.torch_cost import RelaxedCost
 from chsel.errors import ChselError
-from chsel.methods import build_method, preset_settings
+from chsel.methods import METHODS, build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import threads as on_threads
+from chsel.plausible.plausible_set import plausible_set
+from chsel.plausible.plausible_settings import plausible_settings
 from chsel.problem.online_registration import OnlineSettings, first_initial_set
-from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import (
-    ArchiveSnapshot,
     Hypotheses,
+    NullObserver,
     Observer,
     RegistrationProblem,
 )
 from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
-from chsel.problem.settings import in_preset
+from chsel.problem.settings import CheckedSettings, in_preset, positive, settings_mapping
 from chsel.problem.streams import StreamKey
-from runners.benchmarks.timing import Row, Steps, in_turn
+from runners.command.choices import store
 from runners.objects.loader import ObjectConfig, load_object
 from runners.published_package.process import PublishedPackage
+from runners.sessions.configurations import WORKSPACE
 
-WORKSPACE = Workspace((-0.1, -0.3, -0.075), (0.5, 0.3, 0.625))  # of the simulated sessions
 _SDF_RESOLUTION = 0.01
 _YAW = 0.5
+_THREADS = (1, 2)
+
+
+@dataclass(frozen=True)
+class Steps(CheckedSettings):
+    """How much registrations do that are compared with the package, none of which stops early."""
+
+    restarts: Annotated[int, positive] = 10  # of descent
+    adam: Annotated[int, positive] = 50  # Adam steps of a restart
+    search: Annotated[int, positive] = 100  # CMA-MEGA iterations
+    long_search: Annotated[int, positive] = 500  # the same, in the longer row
+
+
+store("effort", "default", settings_mapping(Steps()))
+
+
+@dataclass(frozen=True)
+class Scope:
+    """How much is measured."""
+
+    steps: Steps
+    repeats: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table."""
+
+    measure: str  # what was varied or looked at
+    case: str  # the value of it
+    who: str  # which registration
+    unit: str
+    samples: tuple[float, ...]  # in the order in which they were taken
+    cost: float | None = None  # of the best pose of a registration
+
+    @property
+    def median(self) -> float:
+        """The middle of the samples."""
+        return float(np.median(self.samples))
+
+    @property
+    def quartiles(self) -> tuple[float, float]:
+        """A quarter of the samples is below the first, a quarter above the second."""
+        lower, upper = np.quantile(self.samples, [0.25, 0.75])
+        return float(lower), float(upper)
+
+    def mapping(self) -> dict[str, Any]:
+        """The row as the report's file has it."""
+        return {**asdict(self), "median": self.median, "quartiles": self.quartiles}
+
+
+def in_turn(
+    repeats: int, measured: Mapping[str, Callable[[], float]], *, first_counts: bool = False
+) -> dict[str, tuple[float, ...]]:
+    """Take every measurement once, then all of them again: A B A B, never two at a time.
+
+    first_counts: else each is taken once more, before all others, and that is left out.
+    """
+    samples: dict[str, list[float]] = {name: [] for name in measured}
+    for _ in range(repeats if first_counts else repeats + 1):
+        for name, measure in measured.items():
+            samples[name].append(measure())
+    return {name: tuple(values[-repeats:]) for name, values in samples.items()}
+
+
+def milliseconds(run: Callable[[], object], count: int = 1) -> float:
+    """What a run takes on so many threads."""
+    with on_threads(count):
+        begun = time.perf_counter()
+        run()
+        return 1000.0 * (time.perf_counter() - begun)
 
 
 @dataclass(frozen=True)
@@ -148,13 +224,7 @@ def register(
 
 
 def compare(
-    name: str,
-    steps: Steps,
-    repeats: int,
-    seed: int,
-    package: PublishedPackage | None,
-    *,
-    equation: bool,
+    name: str, scope: Scope, package: PublishedPackage | None, *, equation: bool
 ) -> Iterator[Row]:
     """Rows of one of PROBLEMS: OURS, and in turn with them the package.
 
@@ -162,7 +232,7 @@ def compare(
     free term as well, a third as often, the first one included. cost: of the best pose under the
     paper's equation, the same measure for everyone.
     """
-    problem = pose(PROBLEMS[name], seed)
+    problem, steps = pose(PROBLEMS[name], scope.seed), scope.steps
     search = steps.long_search if PROBLEMS[name].long else steps.search
     found: dict[str, FloatArray] = {}  # poses (B, 4, 4) by who found them
 
@@ -173,26 +243,18 @@ def compare(
 
     def theirs(who: str, cost: str) -> float:
         assert package is not None
-        answer = package.register(
-            cost=cost,
-            restarts=steps.restarts,
-            steps=steps.adam,
-            search=search,
-            seed=seed,
-        )
+        effort = {"restarts": steps.restarts, "steps": steps.adam, "search": search}
+        answer = package.register(cost=cost, seed=scope.seed, **effort)
         # One gradient in an Adam step, one in an iteration of the search.
-        gradients = steps.restarts * steps.adam + search
-        require_equal("gradients of the package", answer["gradients"], gradients)
-        free_points = len(problem.points.free)
-        require_equal("free points of the package", answer["free_points"], free_points)
+        expected = steps.restarts * steps.adam + search, len(problem.points.free)
+        if (counted := (answer["gradients"], answer["free_points"])) != expected:
+            raise BenchmarkError(
+                f"gradients and free points of the package are {counted}, {expected} expected: "
+                "nothing to compare"
+            )
         found[who] = np.array(answer["poses"])
         return 1000.0 * float(answer["seconds"])
 
-    for preset in EQUAL_STEPS:
-        timer = StageTimer()
-        register(problem, preset, steps, search, timer)
-        counted = tuple(timer.iterations.values())
-        require_equal("iterations of ours", counted, (steps.restarts * steps.adam, search))
     labels = {one if one in SIZES else f"ours, {one}": one for one in OURS}
     often = {who: partial(ours, who, one) for who, one in labels.items()}
     seldom = {}
@@ -202,6 +264,7 @@ def compare(
         if equation:
             who = f"{PACKAGE}, Eq. 8"
             seldom[who] = partial(theirs, who, "equation")
+    repeats = scope.repeats
     samples = in_turn(repeats, often) | in_turn(max(1, repeats // 3), seldom, first_counts=True)
     cost = RelaxedCost.of(problem, in_preset(CostSettings(), "paper"))
     for who, taken in samples.items():
@@ -209,31 +272,77 @@ def compare(
         yield Row("registration", name, who, "ms", taken, cost=least)
 
 
-def require_equal(what: str, counted: object, expected: object) -> None:
-    """Raise BenchmarkError if one side would do less work than the other."""
-    if counted != expected:
-        raise BenchmarkError(f"{what}: {counted} counted, {expected} expected: nothing to compare")
-
-
-class StageTimer:
-    """An observer that takes the time of the stages, and counts their iterations."""
-
-    snapshot_interval = 0
+class StageTimer(NullObserver):
+    """An observer that takes the time of the stages."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
-        self.iterations: dict[str, int] = {}
         self._mark = time.perf_counter()
 
     def progress(self, stage: str, iteration: int, total: int) -> None:
         """The time since the last report is the stage's."""
         now = time.perf_counter()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._mark
-        self.iterations[stage] = iteration
         self._mark = now
 
-    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
-        """Ignore it."""
 
-    def snapshot(self, archive: ArchiveSnapshot) -> None:
-        """Ignore it."""
+def stages(scope: Scope) -> Iterator[Row]:
+    """Adam, search, and all else of a registration."""
+    problem = pose(PROBLEMS["real_20"], scope.seed)
+    for name in (*PRESETS, "anchored, adaptive"):
+        parts: dict[str, list[float]] = {}
+        for _ in range(scope.repeats + 1):
+            timer = StageTimer()
+            total, _ = register(problem, name, scope.steps, scope.steps.search, timer)
+            taken = {stage: 1000.0 * seconds for stage, seconds in timer.seconds.items()}
+            for stage, value in (taken | {"other": total - sum(taken.values())}).items():
+                parts.setdefault(stage, []).append(value)
+        for stage, samples in parts.items():
+            yield Row("stage", stage, name, "ms", tuple(samples[1:]))
+
+
+def threads(scope: Scope) -> Iterator[Row]:
+    """One and two threads, in turn, and how many times as fast two are."""
+    for case in ("real_20", "large_20"):
+        problem = pose(PROBLEMS[case], scope.seed)
+        for name in (*PRESETS, "anchored, medium"):
+            once = partial(register, problem, name, scope.steps, scope.steps.search)
+            samples = in_turn(
+                scope.repeats, {str(n): partial(milliseconds, once, n) for n in _THREADS}
+            )
+            for count, taken in samples.items():
+                yield Row("threads", f"{case}, {count}", name, "ms", taken)
+            ratios = np.divide(samples["1"], samples["2"]).tolist()
+            yield Row("speed-up", case, name, "x", tuple(ratios))
+
+
+def methods(scope: Scope) -> Iterator[Row]:
+    """Every method in preset default, stopping when it does, in turn."""
+    problem = pose(PROBLEMS["real_20"], scope.seed)
+
+    def register_with(name: str) -> None:
+        build_method(name).register(replace(problem, points=replace(problem.points)))
+
+    cases = {name: partial(milliseconds, partial(register_with, name)) for name in METHODS}
+    for name, taken in in_turn(scope.repeats, cases).items():
+        yield Row("method", name, "default", "ms", taken)
+
+
+def plausible_sets(scope: Scope) -> Iterator[Row]:
+    """The set of one step, of 34 million poses, on one thread and on two."""
+    settings = plausible_settings("default", 0.001)
+    truth = standing(drill(1.0)[0])
+    for case in ("real_20", "real_150"):
+        once = partial(plausible_set, pose(PROBLEMS[case], scope.seed), truth, settings)
+        named = {f"{case}, {n}": partial(milliseconds, once, n) for n in _THREADS}
+        for name, taken in in_turn(scope.repeats, named).items():
+            yield Row("plausible, threads", name, "default", "ms", taken)
+
+
+MEASURES: dict[str, Callable[[Scope], Iterator[Row]]] = {
+    "stages": stages,
+    "threads": threads,
+    "methods": methods,
+    "plausible_sets": plausible_sets,
+}
+"""What is measured of this library alone."""

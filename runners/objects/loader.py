@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Protocol
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -55,21 +54,9 @@ MODELS = tuple(_TRIALS)
 """Our own models of these objects of the YCB Object and Model Set, files in `models/`."""
 OBJECTS = {name: ObjectConfig(name, *trial) for name, trial in _TRIALS.items()} | {
     f"ycb/{name}": ObjectConfig(name, *_TRIALS[name], kind="scan", scan=scan)
-    for scan, (name, _) in SCANS.items()
+    for scan, name in SCANS.items()
 }
 """The choices of `object=` but for mesh files."""
-
-
-class GridSettings(Protocol):
-    """What the settings of a session say about the grid of its object."""
-
-    @property
-    def object_resolution(self) -> float | None:
-        """Spacing of the nodes, metres; None: as `object_grid` chooses it."""
-
-    @property
-    def object_padding(self) -> float:
-        """Of the grid around the object, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,22 +70,13 @@ class ObjectModel:
     configuration: str
     _grids: dict[tuple[float | None, float], SdfGrid] = field(default_factory=dict, repr=False)
 
-    def grid(
-        self, settings: GridSettings, progress: Callable[[str, int, int], None] = lambda *_: None
-    ) -> SdfGrid:
-        """The signed distance grid that a session's settings ask for, made once.
-
-        progress: gets a name, the number of nodes done and that of all.
-        """
-        key = settings.object_resolution, settings.object_padding
-        if key not in self._grids:
-            self._grids[key] = object_grid(
-                self.mesh,
-                settings.object_resolution,
-                padding=settings.object_padding,
-                progress=lambda done, total: progress("signed distance grid, nodes", done, total),
-            )
-        return self._grids[key]
+    def grid(self, settings: Any) -> SdfGrid:
+        """The signed distance grid that a session's settings ask for, made once."""
+        resolution, padding = settings.object_resolution, settings.object_padding
+        if (resolution, padding) not in self._grids:
+            grid = object_grid(self.mesh, resolution, padding=padding)
+            self._grids[resolution, padding] = grid
+        return self._grids[resolution, padding]
 
     @property
     def diameter(self) -> float:
@@ -111,7 +89,12 @@ def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:
 
     Raises SettingError for an unknown model, MeshError if the mesh is missing or unusable.
     """
-    mesh = _load(config, assets)
+    if config.kind == "file":
+        mesh = load_mesh(config.path or "", scale=config.scale)
+    elif config.kind == "scan":
+        mesh = load_mesh(scan_file(assets, config.scan or ""), scale=config.scale)
+    else:
+        mesh = load_model(config.name, config.scale)
     return ObjectModel(config.name, mesh, config.scale, config.epsilon, config.configuration)
 
 
@@ -135,11 +118,3 @@ def load_model(name: str, scale: float = 1.0) -> trimesh.Trimesh:
     """One of MODELS in the frame of its YCB mesh; metres at scale 1."""
     require_choice("object.name", name, MODELS)
     return load_mesh(Path(__file__).parent / "models" / f"{name}.ply", scale=scale)
-
-
-def _load(config: ObjectConfig, assets: Path) -> trimesh.Trimesh:
-    if config.kind == "file":
-        return load_mesh(config.path or "", scale=config.scale)
-    if config.kind == "scan":
-        return load_mesh(scan_file(assets, config.scan or ""), scale=config.scale)
-    return load_model(config.name, config.scale)

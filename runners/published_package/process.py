@@ -64,10 +64,7 @@ def interpreter(config: PackageConfig, say: Callable[[str], None]) -> Path:
 
 
 def _run(what: str, command: list[str]) -> None:
-    try:
-        done = subprocess.run(command, capture_output=True, text=True)
-    except OSError as error:
-        raise PackageError(f"{what} does not run: {error}") from None
+    done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         raise PackageError(
             f"{what} failed: {last_line(done.stderr or done.stdout)}; accepted: "
@@ -113,16 +110,14 @@ class PublishedPackage:
                 f"package.python {python} does not run ({error.strerror}); {_ACCEPTED}"
             ) from None
         try:
-            self._answer()
-            self.versions = self.ask("describe")
+            self.versions = self._answer()
+            if self.versions["chsel"] != PUBLISHED:
+                raise PackageError(f"it has chsel {self.versions['chsel']}")
         except PackageError as error:
             self.close()
             raise PackageError(
                 f"{python} cannot use the published package: {error}; {_ACCEPTED}"
             ) from None
-        if self.versions["chsel"] != PUBLISHED:
-            self.close()
-            raise PackageError(f"{python} has chsel {self.versions['chsel']}; {_ACCEPTED}")
 
     def load(self, problem: RegistrationProblem, object_bounds: FloatArray) -> None:
         """Hand a problem over; object_bounds (2, 3): of the mesh, in its frame, metres."""
@@ -146,10 +141,7 @@ class PublishedPackage:
             self.ask("load", problem=str(path))
 
     def register(self, **arguments: Any) -> dict[str, Any]:
-        """What the worker's `register` gives; the very first one runs twice.
-
-        So no time holds what is loaded only once.
-        """
+        """What the worker's `register` gives; the first runs twice, as it loads what is needed."""
         if not self._warm:
             self.ask("register", **arguments)
             self._warm = True

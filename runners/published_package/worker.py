@@ -1,7 +1,7 @@
 """Registers with the published package `chsel`, in the interpreter that has it, on request.
 
 A program of its own that imports nothing of this project, whose package has the same name. It
-reads requests and writes answers, one JSON object a line; see process.py.
+writes versions, then reads requests and writes answers, one JSON object a line; see process.py.
 """
 
 from __future__ import annotations
@@ -82,16 +82,14 @@ class Worker:
                 GridSdf(self._data),
                 cache_path=str(Path(folder) / "sdf.pkl"),
             )
-        free, known = self._data["free"], self._data["known"]
-        occupied = self._data["occupied"]
-        classes = self._chsel.SemanticsClass
-        points = np.concatenate([free, known, occupied])
-        self._positions = torch.tensor(points, dtype=torch.float32)
-        semantics = [classes.FREE.value] * len(free) + [classes.SURFACE.value] * len(known)
-        semantics += [classes.OCCUPIED.value] * len(occupied)
-        self._semantics = torch.tensor(semantics)
+        kinds = self._chsel.SemanticsClass
+        classes = {"free": kinds.FREE, "known": kinds.SURFACE, "occupied": kinds.OCCUPIED}
+        points = [self._data[name] for name in classes]
+        self._positions = torch.tensor(np.concatenate(points), dtype=torch.float32)
+        numbers, counts = [kind.value for kind in classes.values()], [len(p) for p in points]
+        self._semantics = torch.tensor(np.repeat(numbers, counts))
         self._initial_set = torch.tensor(self._data["initial_set"], dtype=torch.float32)
-        return {"loaded": problem}
+        return {}
 
     def register(
         self, seed: int, cost: str = "", restarts: int = 0, steps: int = 0, search: int = 0
@@ -180,10 +178,10 @@ def main() -> None:
 
     try:
         worker = Worker()
+        answer(worker.describe())
     except Exception as error:
         answer({"error": f"{type(error).__name__}: {error}"})
         return
-    answer({"ready": True})
     for line in sys.stdin:
         request = json.loads(line)
         try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import shlex
-import shutil
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -14,7 +13,6 @@ from typing import Any
 import numpy as np
 from rich.filesize import decimal
 from rich.progress import BarColumn, TimeElapsedColumn
-from rich.table import Table
 
 from chsel.errors import InputWarning
 from chsel.numerics.compiler import watched
@@ -23,7 +21,7 @@ from chsel.problem.poses import quaternions
 from chsel.problem.registration_problem import Trust
 from replay.console import Console, Progress, TextColumn, plain_table
 from runners.run.session_run import FROM_SESSION, StepWarning
-from runners.sensors.session_report import Counts, Report
+from runners.sensors.session_report import Report
 
 MEANINGS = {
     "determined": "one pose explains the points",
@@ -37,9 +35,14 @@ STOPPED = {
     "actions": "no probe is left that can be made",
     "budget": "policy.probes allows no more",
 }
-_LEFT_OUT = {
+_COUNTS = {
+    "images": "images",
+    "used": "used",
     "no pose": "lost",
     "bad": "unusable",
+    "pixels": "pixels",
+    "invalid": "invalid",
+    "edge": "edges",
     "outline": "outline",
     "small": "small",
     "far": "far",
@@ -48,7 +51,7 @@ _LEFT_OUT = {
     "points": "contacts",
     "new voxels": "free",
 }
-"""Columns of the table of sensors that are counts, by their fields of `Counts`."""
+"""Columns of the table of sensors, by their fields of `Counts`."""
 
 
 def counting_bar(console: Console) -> Progress:
@@ -88,68 +91,30 @@ def compiling_line() -> Iterator[None]:
                 progress.stop()
 
 
-class Bar:
-    """What is being done, and how much of it is done."""
-
-    def __init__(self, console: Console) -> None:
-        self._progress = counting_bar(console)
-        self._task: Any = None
-
-    def show(self, stage: str, done: int, total: int) -> None:
-        """A stage stands at `done` of `total`."""
-        if self._task is None:
-            self._progress.start()
-            self._task = self._progress.add_task(stage, completed=done, total=total)
-        self._progress.update(self._task, description=stage, completed=done, total=total)
-
-    def clear(self) -> None:
-        """Give the line back."""
-        if self._task is not None:
-            self._progress.remove_task(self._task)
-            self._task = None
-        self._progress.stop()
-
-
-@contextmanager
-def reading_bar() -> Iterator[Bar]:
-    """A bar of its own, as long as a session is opened."""
-    bar = Bar(Console())
-    try:
-        yield bar
-    finally:
-        bar.clear()
-
-
 class Display:
-    """One line a probe, a bar within a registration, a table at the end."""
+    """One line a probe, a table at the end."""
 
     def __init__(self, title: str) -> None:
         self._console = Console()
         self._warned = {FROM_SESSION}  # codes; what the session itself remarks is in its report
-        self._bar = Bar(self._console)
         self._console.print(title, style="bold")
 
     def probes(self, count: int) -> None:
         """How many there will be; their numbers are the steps of the recording."""
         numbers = f"probes 0 to {count - 1}" if count > 1 else "probe 0"
-        self._console.print(f"{numbers}, numbered as the steps of the recording")
+        self.say(f"{numbers}, numbered as the steps of the recording")
 
     def stopped(self, steering: Steering) -> None:
         """Why a steered session has ended, if it has by its policy."""
         if steering.last is not None and steering.last.decision.stop:
             problem, decision = steering.last
-            self._console.print(
+            self.say(
                 f"stopped after {problem.key.step} probes: {STOPPED[decision.stop]} (spread "
                 f"{1000.0 * decision.spread:.1f} mm)"
             )
 
-    def working(self, stage: str, iteration: int, total: int) -> None:
-        """A stage of the registration, or of reading, stands at `iteration` of `total`."""
-        self._bar.show(stage, iteration, total)
-
     def probe(self, row: Mapping[str, Any]) -> None:
         """A probe, and the registration after it if there was one, are done."""
-        self._bar.clear()
         text = f"probe {row['step']:>3} {row['outcome']:<7} {row['contacts']:>3} contacts"
         text += f" {row['free_points']:>6} free"
         if "best_cost" in row:
@@ -157,7 +122,7 @@ class Display:
             text += "" if "spread" in row else f" {row['distinct']:>2} distinct"
         if "spread" in row:
             text += f" spread {1000.0 * row['spread']:3.0f} mm"
-        self._console.print(f"{text} {row['seconds']:>5.2f} s")
+        self.say(f"{text} {row['seconds']:>5.2f} s")
 
     def warn(self, warnings: Iterable[InputWarning | StepWarning]) -> None:
         """Warnings that were not shown before, each kind once."""
@@ -174,7 +139,7 @@ class Display:
         """The registrations of the session, with errors to the true pose where it is known."""
         rows = [row for row in rows if "best_cost" in row]
         if not rows:
-            self._console.print("no registration: too few contacts or probes for one")
+            self.say("no registration: too few contacts or probes for one")
             return
         truth = "best_position_error" in rows[-1]
         title = "registrations"
@@ -189,95 +154,53 @@ class Display:
         table.add_column("verdict", no_wrap=True)
         for row in rows:
             cells = [str(row["step"]), str(row["contacts"]), f"{row['best_cost']:.4g}"]
-            if truth:
-                cells += [*_errors(row, "best"), *_errors(row, "closest")]
+            for which in ("best", "closest") if truth else ():
+                cells.append(f"{1000.0 * row[f'{which}_position_error']:.1f}")
+                cells.append(f"{math.degrees(row[f'{which}_rotation_error']):.1f}")
             milliseconds = f"{1000.0 * row['registration_seconds']:.0f} ms"
             table.add_row(*cells, milliseconds, row.get("verdict", ""))
         self._console.print(table)
 
     def sensed(self, report: Report) -> None:
-        """What became of a robot's sensor data, probe by probe, and what was wrong with it."""
-        if report.by_probe:
-            self._console.print(_sensor_table(report))
+        """What became of a robot's sensor data, and what was wrong with it."""
+        total = {name: vars(counts) for name, counts in report.total().items() if counts.images}
+        columns = {
+            title: field
+            for title, field in _COUNTS.items()
+            if any(counts[field] for counts in total.values())
+        }
+        if total:
+            title = "sensors, over all probes; left out: pixels or points"
+            table = plain_table(title, texts=["sensor"], numbers=list(columns))
+            for name, counts in total.items():
+                table.add_row(name, *(str(counts[field] or "") for field in columns.values()))
+            self._console.print(table)
         for level, text in report.lines:
             self.say(f"warning: {text}" if level == "warning" else text)
 
-    def written(self, folder: Path, files: Mapping[str, int]) -> None:
+    def written(self, folder: Path) -> None:
         """What lies in the run's folder, and how to look at it; paths on lines of their own."""
         self._console.print(f"{folder}/", soft_wrap=True)
-        for name, size in files.items():
-            self._console.print(f"  {name:<15} {decimal(size):>9}")
-        if "recording.rrd" in files:
-            viewer = f"{_program('rerun')} --bind 127.0.0.1"
-            path = shlex.quote(str(folder / "recording.rrd"))
-            self._console.print("look at it:")
-            self._console.print(f"{viewer} {path}", soft_wrap=True)
+        for file in sorted(folder.iterdir()):
+            self.say(f"  {file.name:<15} {decimal(file.stat().st_size):>9}")
+            if file.suffix == ".rrd":
+                viewer = shlex.join([str(Path(sys.executable).with_name("rerun")), str(file)])
+                self._console.print(f"    {viewer} --bind 127.0.0.1", soft_wrap=True)
 
-    def pose(self, rows: list[dict[str, Any]], folder: Path) -> None:
-        """The best pose of the last registration that found one, and how to write all of them."""
+    def pose(self, rows: list[dict[str, Any]]) -> None:
+        """The best pose of the last registration that found one."""
         row = next((row for row in reversed(rows) if "world_from_object" in row), None)
         if row is None:
             return
-        recording = folder / "recording.mcap"
-        if recording.is_file():
-            python = _program(Path(sys.executable).name)
-            export = f"export {shlex.quote(str(recording))} --what hypotheses --format npz"
-            self._console.print("all hypotheses as arrays:")
-            self._console.print(f"{python} -m replay {export}", soft_wrap=True)
         pose = np.array(row["world_from_object"])
         position = " ".join(f"{number:.1f}" for number in 1000.0 * pose[:3, 3])
         quaternion = " ".join(f"{number:.4f}" for number in quaternions(pose[None, :3, :3])[0])
         where = "world_from_object (one per mode: summary.json)"
-        self._console.print(f"best pose after probe {row['step']}, {where}:")
-        self._console.print(f"  position {position} mm")
-        self._console.print(f"  quaternion {quaternion} (x y z w)")
+        self.say(f"best pose after probe {row['step']}, {where}:")
+        self.say(f"  position {position} mm")
+        self.say(f"  quaternion {quaternion} (x y z w)")
 
     def verdict(self, trust: Trust | None) -> None:
         """How far to trust the last result, if there is one."""
         if trust is not None:
-            self._console.print(f"{trust}: {MEANINGS[trust.verdict]}")
-
-    def close(self) -> None:
-        """Give the terminal back."""
-        self._bar.clear()
-
-
-def _program(name: str) -> str:
-    """How to start a program of this environment from here."""
-    beside = Path(sys.executable).with_name(name)
-    if shutil.which(name) == str(beside) or not beside.is_file():
-        return name
-    return str(beside.relative_to(Path.cwd()) if beside.is_relative_to(Path.cwd()) else beside)
-
-
-def _sensor_table(report: Report) -> Table:
-    """Counts by probe and sensor, of those that have images, and the totals."""
-    rows: list[tuple[str, str, Counts]] = []
-    total = {"all": report.total()} if len(report.by_probe) > 1 else {}
-    for step, by_sensor in [*report.by_probe.items(), *total.items()]:
-        used = [(sensor, counts) for sensor, counts in by_sensor.items() if counts.images]
-        rows += [("" if k else str(step), *entry) for k, entry in enumerate(used)]
-    columns = {
-        "used": [f"{counts.used}/{counts.images}" for _, _, counts in rows],
-        "invalid": [_share(counts.invalid, counts.pixels) for _, _, counts in rows],
-        "edge": [_share(counts.edges, counts.pixels) for _, _, counts in rows],
-    }
-    for name, field in _LEFT_OUT.items():
-        columns[name] = [str(getattr(counts, field) or "") for _, _, counts in rows]
-    columns = {name: cells for name, cells in columns.items() if any(cells)}
-    title = "sensors; left out: invalid, edge in % of pixels, others in pixels or points"
-    table = plain_table(title, texts=["probe", "sensor"], numbers=list(columns))
-    table.pad_edge = True
-    for index, (step, sensor, _) in enumerate(rows):
-        table.add_row(step, sensor, *(cells[index] for cells in columns.values()))
-    return table
-
-
-def _share(count: int, of: int) -> str:
-    return f"{100.0 * count / of:.1f}" if of else ""
-
-
-def _errors(row: Mapping[str, Any], which: str) -> tuple[str, str]:
-    """Position error in millimetres, rotation error in degrees."""
-    millimetres = 1000.0 * row[f"{which}_position_error"]
-    return f"{millimetres:.1f}", f"{math.degrees(row[f'{which}_rotation_error']):.1f}"
+            self.say(f"{trust}: {MEANINGS[trust.verdict]}")

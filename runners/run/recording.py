@@ -12,12 +12,10 @@ from typing import Annotated
 from chsel.errors import RecordingError
 from chsel.problem.settings import CheckedSettings, not_negative
 from replay.events import Recorder
-from replay.files import WritingError, whole_file
+from replay.files import whole_file
 from replay.mcap.writer import McapRecorder
 from replay.recorder import Recorders
 
-IN_RUN_FOLDER = "a logs=DIR that can be written"
-"""What is accepted where a file of a run cannot be written."""
 # What Rerun itself would print of a failing disk, over several lines; one line of ours says it.
 _LOG_FILTER = "error,re_log_encoding=off,re_sdk=off"
 
@@ -54,9 +52,7 @@ def make_run_folder(logs: Path, *names: str) -> Path:
 
 def write_in_run_folder(path: Path, text: str) -> None:
     """Write a file of a run. Raises WritingError, which names it, if that cannot be done."""
-    if not path.parent.is_dir():  # it was removed during the run, and is not made again
-        raise WritingError(f"{path} cannot be written: its folder was removed")
-    with whole_file(path, IN_RUN_FOLDER) as beside:
+    with whole_file(path, "a logs=DIR that can be written") as beside:
         beside.write_text(text)
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from chsel.errors import InputWarning, SessionError
 from chsel.numerics.threads import require_threads
 from chsel.policies import build_policy
-from chsel.policies.policy import Policy
 from chsel.policies.steering import Steering
 from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
 from chsel.problem.sdf_grid import SdfGrid
@@ -24,8 +23,7 @@ from runners.sensors.session_report import Report
 from runners.sessions import open_session, session_settings
 from runners.sessions.probing_settings import without_defaults
 from runners.sessions.recorded import RecordedSession
-from runners.sessions.sensors import DepthFrameSession, SensorsSession
-from runners.sessions.session import Progress, Session, Steerable, unwatched
+from runners.sessions.session import Session, Steerable
 
 if TYPE_CHECKING:
     import trimesh
@@ -66,17 +64,6 @@ class ProbeConfig:
         require_threads("threads", self.threads)
 
 
-@dataclass
-class Watcher:
-    """Hands progress on to whatever shows it at the time."""
-
-    show: Progress = unwatched
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        """See `Progress`."""
-        self.show(stage, done, total)
-
-
 @dataclass(frozen=True, eq=False)
 class Scene:
     """The session and the object that it hides."""
@@ -86,15 +73,13 @@ class Scene:
     mesh: trimesh.Trimesh
     sdf: SdfGrid
     start: Start
-    watcher: Watcher = field(default_factory=Watcher)  # gets the progress of what is read
     warnings: tuple[InputWarning, ...] = ()  # about the object
     steering: Steering | None = None  # chooses the probes; None for the session's own order
 
     @property
     def report(self) -> Report | None:
         """What became of sensors' images, once they are read."""
-        session = self.session
-        return session.report if isinstance(session, SensorsSession | DepthFrameSession) else None
+        return getattr(self.session, "report", None)
 
     def online(self, settings: OnlineSettings, seed: int) -> OnlineRegistration:
         """The loop of the session, before its first step; see `OnlineRegistration`."""
@@ -109,13 +94,17 @@ class Scene:
         )
 
 
-def open_scene(config: ProbeConfig, show: Progress = unwatched) -> Scene:
-    """Open the session with its object; a recorded session brings its own."""
-    watcher = Watcher(show)
-    session_config = dict(config.session)
-    kind = str(session_config.pop("kind", None))
-    settings = session_settings(kind, session_config)
-    policy = _policy(config.policy)
+def open_scene(config: ProbeConfig) -> Scene:
+    """Open the session with its object; a recorded session brings its own.
+
+    Raises SessionError for a policy on a session whose probes cannot be chosen.
+    """
+    values = dict(config.session)
+    kind = str(values.pop("kind", None))
+    settings = session_settings(kind, values)
+    values = dict(config.policy)
+    policy_name = str(values.pop("name", None))
+    policy = build_policy(policy_name, values)
     found: list[InputWarning] = []
     session: Session
     if kind == "recorded":
@@ -124,46 +113,22 @@ def open_scene(config: ProbeConfig, show: Progress = unwatched) -> Scene:
         name, mesh, sdf = of.object, of.mesh, of.sdf
     else:
         model, found = _load_object(config)
-        session = open_session(kind, settings, model, config.seed, watcher)
-        name, mesh, sdf = model.name, model.mesh, model.grid(settings, watcher)
+        session = open_session(kind, settings, model, config.seed)
+        name, mesh, sdf = model.name, model.mesh, model.grid(settings)
         start = Start(settings.start_contacts, settings.start_probe)
         if kind in _OF_REAL_OBJECTS:
             found += check_size(model, session.workspace)
-    steering = _steering(policy, kind, session, sdf, config.seed)
-    if steering is not None:
-        start = FIRST_CONTACT
-    return Scene(session, name, mesh, sdf, start, watcher, tuple(found), steering)
-
-
-def _policy(config: Mapping[str, Any]) -> Policy | None:
-    """The policy that is asked for; None for the session's own order."""
-    values = dict(config)
-    name = str(values.pop("name", None))
-    policy = build_policy(name, values)
-    return None if name == GRID else policy
-
-
-def _steering(
-    policy: Policy | None, kind: str, session: Session, sdf: SdfGrid, seed: int
-) -> Steering | None:
-    """What chooses a session's probes by a policy. SessionError if they cannot be chosen."""
-    if policy is None:
-        return None
+    if policy_name == GRID:
+        return Scene(session, name, mesh, sdf, start, tuple(found))
     if not isinstance(session, Steerable):
         raise SessionError(
             f"session {kind} cannot be steered, as its probes are given; accepted: policy=grid, or "
             "session=kinematic, simulated or recorded"
         )
     actions = session.offer(policy.settings.actions)
-    return Steering(
-        policy,
-        sdf,
-        session.workspace,
-        session.free_resolution,
-        actions,
-        session.hand,
-        seed=seed,
-    )
+    place = sdf, session.workspace, session.free_resolution
+    steering = Steering(policy, *place, actions, session.hand, seed=config.seed)
+    return Scene(session, name, mesh, sdf, FIRST_CONTACT, tuple(found), steering)
 
 
 def _load_object(config: ProbeConfig) -> tuple[ObjectModel, list[InputWarning]]:

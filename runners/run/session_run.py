@@ -17,15 +17,7 @@ from chsel.problem.points import KnownPoints, check_contacts, check_points
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.trust import check_trust
-from replay.events import (
-    ActionsOffered,
-    Decided,
-    Logged,
-    Probe,
-    ProblemPosed,
-    Recorder,
-    Timed,
-)
+from replay.events import ActionsOffered, Decided, Logged, Probe, ProblemPosed, Recorder, Timed
 from replay.registration import Registered, register_recorded
 from runners.run.recording import RecordingConfig
 from runners.sessions.session import Session, SessionEvent, Steerable
@@ -67,8 +59,8 @@ class SessionRun:
     ) -> None:
         """symmetry: of the object, for errors to the true pose; None where that is not known.
 
-        opening: warnings about what was opened, which are recorded with the first probe. steering:
-        chooses the probes of a session that can be steered; None for the session's own order.
+        opening: warnings that are recorded with the first probe. steering: chooses the probes of a
+        session that can be steered; None for the session's own order.
         """
         self._session, self._online, self._method = session, online, method
         self._recorder, self._recording = recorder, recording
@@ -104,21 +96,14 @@ class SessionRun:
                 "free_points": len(self._online.points.free),
             }
             if step.problem is not None and self.registered is not None:
-                found = self.registered.hypotheses
-                trust = found.trust
-                if len(found.cost) > 0:
-                    row["best_cost"] = float(found.cost[0])
-                row |= {"distinct": found.distinct, "digest": found.digest}
-                row |= self.registered.numbers
-                row["registration_seconds"] = self.registered.total_seconds
-                if trust is not None:
-                    self._warn(check_trust(trust, noise_of(self._method)))
-                    self.trust, row["verdict"] = trust, trust.verdict
-                    modes = inverse(found.object_from_world[[*trust.best_of_modes]]).tolist()
-                    row |= {"world_from_object": modes[0], "modes_world_from_object": modes}
+                row |= self._numbers(self.registered)
             if self.steering is not None:
                 row |= self._decide(step.step, self.steering)
-            self._recorder.record(Logged(step.step, "info", self._line(row)))
+            text = f"probe {step.step}: {row['outcome']}, {row['contacts']} contacts"
+            if "digest" not in row:
+                text += ", too little for a registration"
+            text += f"; {self.trust}" if "verdict" in row else ""
+            self._recorder.record(Logged(step.step, "info", text))
             if self._recording.timings:
                 self._recorder.record(Timed(step.step, self._seconds))
             self._recorder.flush()
@@ -127,6 +112,19 @@ class SessionRun:
         self._check_points()
         self._warn(check_contacts(self._online.points))
         self._recorder.flush()
+
+    def _numbers(self, registered: Registered) -> Row:
+        """Numbers about a registration; its trust is that of the session so far."""
+        found, trust = registered.hypotheses, registered.hypotheses.trust
+        row: Row = {"best_cost": float(found.cost[0])} if len(found.cost) else {}
+        row |= {"distinct": found.distinct, "digest": found.digest, **registered.numbers}
+        row["registration_seconds"] = registered.total_seconds
+        if trust is not None:
+            self._warn(check_trust(trust, noise_of(self._method)))
+            self.trust, row["verdict"] = trust, trust.verdict
+            modes = inverse(found.object_from_world[[*trust.best_of_modes]]).tolist()
+            row |= {"world_from_object": modes[0], "modes_world_from_object": modes}
+        return row
 
     def register(self, problem: RegistrationProblem) -> Hypotheses:
         """Check the points, register the problem by the run's method, and record it."""
@@ -199,13 +197,6 @@ class SessionRun:
         workspace, resolution = self._session.workspace, self._session.free_resolution
         points, diameter = self._online.points, self._online.sdf.diameter
         self._warn(check_points(points, diameter, resolution, workspace))
-
-    def _line(self, row: Row) -> str:
-        """What the recording's log says about a probe."""
-        text = f"probe {row['step']}: {row['outcome']}, {row['contacts']} contacts"
-        if "digest" not in row:
-            return f"{text}, too little for a registration"
-        return f"{text}; {self.trust}" if "verdict" in row else text
 
     def _warn(self, found: Iterable[InputWarning]) -> None:
         """Record warnings, each kind once a session."""

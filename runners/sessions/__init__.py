@@ -14,7 +14,7 @@ from runners.sessions.probing import open_probing
 from runners.sessions.probing_settings import ProbingSettings
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 from runners.sessions.sensors import SensorsSettings, open_sensors
-from runners.sessions.session import Progress, Session, unwatched
+from runners.sessions.session import Session
 
 SESSIONS: dict[str, type[Any]] = {
     "simulated": ProbingSettings,
@@ -31,23 +31,17 @@ def session_settings(kind: str, config: Mapping[str, Any]) -> Any:
     return build_settings(SESSIONS[kind], config, "session")
 
 
-def open_session(
-    kind: str,
-    settings: Any,
-    object_model: ObjectModel,
-    seed: int,
-    progress: Progress = unwatched,
-) -> Session:
-    """Open a session with settings from `session_settings`; `progress` follows long readings.
+def open_session(kind: str, settings: Any, object_model: ObjectModel, seed: int) -> Session:
+    """Open a session with settings from `session_settings`.
 
-    Raises SessionError if it cannot be opened, or if a configuration is one of another object.
+    Raises ChselError if it cannot be opened, or if a configuration is one of another object.
     """
     if kind == "points":
-        return PointsSession(settings, object_model, progress)
+        return PointsSession(settings, object_model)
     if kind == "recorded":
         return RecordedSession(settings)
     if kind == "sensors":
-        return open_sensors(settings, object_model, seed, progress)
+        return open_sensors(settings, object_model, seed)
     configuration = settings.configuration or object_model.configuration
     find_configuration(configuration, object_model.name)
     return open_probing(kind, object_model.mesh, configuration, settings, seed)

@@ -58,8 +58,7 @@ class Gripper:
     """The hand's control: proportional, noisy, in control steps of MINI_STEPS mini-steps."""
 
     def __init__(self, engine: Engine, settings: ProbingSettings, seed: int) -> None:
-        self._engine = engine
-        self._settings = settings
+        self._engine, self._settings = engine, settings
         stream = StreamKey(seed, 0).stream(Purpose.CONTROL_NOISE)
         self._noise = settings.noise * stream.standard_normal((NOISE_ROWS, 3))
         self._steps = 0
@@ -76,11 +75,7 @@ class Gripper:
 
     def move_to(self, y: float, z: float) -> None:
         """Go sideways to y and z, metres."""
-        for _ in range(MOST_STEPS):
-            error = np.array([0.0, y, z]) - self._position * [0.0, 1.0, 1.0]
-            if np.sqrt(error @ error) < TOLERANCE:
-                return
-            self._control_step(GAIN * error)
+        self._go(np.array([0.0, y, z]), np.array([0.0, 1.0, 1.0]))
 
     def push(self) -> None:
         """Go forward until something resists, or for so many control steps."""
@@ -90,11 +85,7 @@ class Gripper:
 
     def withdraw(self) -> None:
         """Go back before the object."""
-        for _ in range(MOST_STEPS):
-            error = X_REST - float(self._position[0])
-            if abs(error) < TOLERANCE:
-                return
-            self._control_step(np.array([GAIN * error, 0.0, 0.0]))
+        self._go(np.array([X_REST, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
 
     def probe_along(self, pose: FloatArray, length: float) -> None:
         """Start at a pose (4, 4), go along its z axis until something resists, and return.
@@ -113,12 +104,17 @@ class Gripper:
             if self._control_step(command) > self._settings.stop_force:
                 break
             left -= part
+        self._go(start, np.ones(3), straight=True)
+
+    def _go(self, target: FloatArray, axes: FloatArray, *, straight: bool = False) -> None:
+        """Go to a target (3,) along some axes (3,), 0 or 1 each, or straight."""
         for _ in range(MOST_STEPS):
-            error = start - self._position
+            error = (target - self._position) * axes
             if np.sqrt(error @ error) < TOLERANCE:
                 return
             command = GAIN * error
-            self._control_step(command / max(1.0, float(np.sqrt(command @ command))))
+            length = float(np.sqrt(command @ command)) if straight else 1.0
+            self._control_step(command / max(1.0, length))
 
     def _clear_start(self, pose: FloatArray, length: float) -> tuple[FloatArray, float]:
         """Put the hand at a pose (4, 4), or behind it; where that is (3,), and the way from it."""

@@ -53,9 +53,10 @@ class KinematicEngine:
             # Only what is nearer now than the way it went can have gone through the surface.
             close = near[self._clearance[near] <= length]
             if len(close) > 0:
-                points = self._inside(
-                    patches.points[np.isin(patches.labels, close)], target, length
-                )
+                points = patches.points[np.isin(patches.labels, close)]
+                points = points[self._object.distance(points + target) <= length]
+                if len(points) > 0:
+                    points = points[self._object.closest(points + target)[0] <= 0.0]
                 if len(points) > 0:
                     return self._touch(points, motion, length)
         self._position = target
@@ -75,13 +76,6 @@ class KinematicEngine:
 
     def close(self) -> None:
         """Nothing to let go of."""
-
-    def _inside(self, points: FloatArray, target: FloatArray, length: float) -> FloatArray:
-        """Those of the hand's points (S, 3) that a motion of that length has brought inside."""
-        points = points[self._object.distance(points + target) <= length]
-        if len(points) == 0:
-            return points
-        return points[self._object.closest(points + target)[0] <= 0.0]
 
     def _touch(self, points: FloatArray, motion: FloatArray, length: float) -> Touch:
         """Bisect for when the first of points (S, 3) gets in; at the end of the way all are in."""

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import math
+import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +13,13 @@ import numpy as np
 from chsel.errors import ChselError, PointsError, PoseError, SettingError, require_positive
 from chsel.numerics.arrays import FloatArray, IntArray, frozen
 from chsel.problem.defaults import FREE_RESOLUTION, workspace_around
-from chsel.problem.file_checks import read_npz, refuse_special_file
-from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace, check_points
+from chsel.problem.file_checks import read_npz
+from chsel.problem.points import KnownPoints, Workspace, check_points
 from chsel.problem.poses import nearest_rigid
 from chsel.problem.sdf_grid import OBJECT_PADDING
 from chsel.problem.streams import LAST_STEP
 from replay.events import Probe
 from runners.objects.loader import ObjectModel
-from runners.sessions.session import Progress, unwatched
 
 
 @dataclass(frozen=True)
@@ -33,7 +30,6 @@ class PointsSettings:
     workspace: tuple[tuple[float, float], ...] | None = None
     """[[x0, x1], [y0, y1], [z0, z1]], metres; None: around the points, padded by the diameter."""
     free_resolution: float = FREE_RESOLUTION  # voxel side of free space, metres
-    merge_free: bool = False  # keep one free point a voxel, at its centre
     object_resolution: float | None = None  # of the SDF grid, metres; None: that of `object_grid`
     object_padding: float = OBJECT_PADDING  # of the SDF grid, metres
     start_contacts: int = 0  # a registration needs so many contacts
@@ -50,40 +46,34 @@ class PointsSettings:
 
 
 class PointsSession:
-    """Replays the steps of a file; a probe's index is the file's step.
+    """Replays the steps of a file; a probe's index is the file's step; see `Session`.
 
     Raises PointsError for points that cannot be those of the object.
     """
 
-    def __init__(
-        self, settings: PointsSettings, object_model: ObjectModel, progress: Progress = unwatched
-    ) -> None:
-        """progress: gets that of the SDF grid, whose diameter pads the workspace."""
+    def __init__(self, settings: PointsSettings, object_model: ObjectModel) -> None:
         assert settings.path is not None
         self._file = read_points(settings.path)
-        self._steps = self._file.steps
-        self._merge = settings.merge_free
+        self._steps = np.unique(self._file.steps).tolist()
         self.free_resolution = settings.free_resolution
         self.world_from_object = self._file.world_from_object
         self.initial_points = KnownPoints()
         self.count = len(self._steps)
         every = KnownPoints.joined([self._file.at(step) for step in self._steps])
-        given = _given_workspace(settings)
+        given = None
+        if settings.workspace is not None:
+            (x0, x1), (y0, y1), (z0, z1) = settings.workspace
+            given = Workspace((x0, y0, z0), (x1, y1, z1))
         try:  # before any work; warnings are given when the points become known
             check_points(every, object_model.diameter, self.free_resolution, given)
         except PointsError as error:
             raise PointsError(f"point file {settings.path}: {error}") from None
-        self.workspace = given or workspace_around(every, object_model.grid(settings, progress))
+        self.workspace = given or workspace_around(every, object_model.grid(settings))
 
     def probes(self) -> Iterator[Probe]:
         """One probe per step of the file."""
-        voxels = FreeVoxels(Lattice(self.workspace.lower, self.free_resolution))
         for step in self._steps:
             points = self._file.at(step)
-            if self._merge:
-                points = KnownPoints(
-                    voxels.add(points.free), points.occupied, points.known, points.sdf
-                )
             contacts = points.contacts
             yield Probe(step, "points", points, contacts=contacts, contact_normals=0.0 * contacts)
 
@@ -91,68 +81,34 @@ class PointsSession:
         """Nothing is held open."""
 
 
-def _given_workspace(settings: PointsSettings) -> Workspace | None:
-    if settings.workspace is None:
-        return None
-    (x0, x1), (y0, y1), (z0, z1) = settings.workspace
-    return Workspace((x0, y0, z0), (x1, y1, z1))
-
-
 KINDS = ("surface", "free", "occupied", "known")
-_LONGEST_TEXT = 60  # characters that an error quotes of a file
-_COLUMNS = ("x", "y", "z", "kind", "sdf", "step")
-
-
-@dataclass(frozen=True, eq=False)
-class PointClass:
-    """Points (N, 3) of one kind, their signed distances (N,), and the steps (N,) they come at."""
-
-    points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    sdf: FloatArray = field(default_factory=lambda: np.zeros(0))
-    steps: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-
-    def at(self, step: int) -> PointClass:
-        """Those that become known at a step, in the order of the file."""
-        order, steps = self._by_step
-        first, last = np.searchsorted(steps, (step, step + 1))
-        now = order[first:last]
-        return PointClass(self.points[now], self.sdf[now], self.steps[now])
-
-    @cached_property
-    def _by_step(self) -> tuple[IntArray, IntArray]:
-        """The points (N,) in the order of their steps, and these steps (N,)."""
-        order = np.argsort(self.steps, kind="stable")
-        return order, self.steps[order]
+_COLUMNS = ["x", "y", "z", "kind", "sdf", "step"]
 
 
 @dataclass(frozen=True, eq=False)
 class PointFile:
-    """What a file holds: a class for each of KINDS, and the true pose (4, 4) where it is given."""
+    """The points of a file in its order, each with its kind, signed distance and step."""
 
-    classes: dict[str, PointClass]
-    world_from_object: FloatArray | None = None
-
-    @property
-    def steps(self) -> list[int]:
-        """The steps at which anything becomes known, ascending."""
-        every = np.concatenate([group.steps for group in self.classes.values()])
-        return [int(step) for step in np.unique(every)]
+    kinds: np.ndarray  # (N,), of KINDS
+    points: FloatArray  # (N, 3), world, metres
+    sdf: FloatArray  # (N,), metres; that of known points alone counts
+    steps: IntArray  # (N,): at which each becomes known
+    world_from_object: FloatArray | None = None  # (4, 4): the true pose, where it is given
 
     def at(self, step: int) -> KnownPoints:
         """All that becomes known at a step; surface points are known points of distance 0."""
-        now = {kind: self.classes[kind].at(step) for kind in KINDS}
-        return KnownPoints(
-            free=now["free"].points,
-            occupied=now["occupied"].points,
-            known=np.concatenate([now["surface"].points, now["known"].points]),
-            known_sdf=np.concatenate([now["surface"].sdf, now["known"].sdf]),
+        surface, free, occupied, known = (
+            np.flatnonzero((self.kinds == kind) & (self.steps == step)) for kind in KINDS
         )
+        known = np.concatenate([surface, known])
+        points = self.points
+        return KnownPoints(points[free], points[occupied], points[known], self.sdf[known])
 
 
 def read_points(path: str | Path) -> PointFile:
     """Read .npz, .csv, or the vertices of .ply, .off, .xyz and .stl as surface points.
 
-    Raises PointsError, which names the file and the array or line, for anything malformed.
+    Raises PointsError, which names the file and the array or row, for anything malformed.
     """
     path = Path(path).expanduser()
     reader = _READERS.get(path.suffix.lower())
@@ -160,119 +116,82 @@ def read_points(path: str | Path) -> PointFile:
         raise PointsError(
             f"point file {path} has the suffix {path.suffix!r}; accepted: {', '.join(_READERS)}"
         )
-    refuse_special_file(f"point file {path}", path, PointsError)
     if not path.is_file():
         raise PointsError(f"point file {path} does not exist; accepted: a file")
     try:
         content = reader(path)
+        if len(content.points) == 0:
+            raise PointsError("it holds no points; accepted: at least one")
+        first, last = content.steps.min(), content.steps.max()
+        if first < 0 or last > LAST_STEP:
+            raise PointsError(f"steps are from {first} to {last}; accepted: 0 to {LAST_STEP}")
     except ChselError as error:
         raise PointsError(f"point file {path}: {error}") from None
-    if not content.steps:
-        raise PointsError(f"point file {path} holds no points; accepted: at least one")
     return content
 
 
 def _read_npz(path: Path) -> PointFile:
     accepted = [*KINDS, "known_sdf", *(f"{kind}_step" for kind in KINDS), "world_from_object"]
     arrays = read_npz(path, accepted=accepted, error=PointsError)
-    for name, array in arrays.items():
-        if array.dtype.kind not in "fiu":
-            raise PointsError(f"{name} has type {array.dtype}; accepted: numbers")
-    if not any(kind in arrays for kind in KINDS):
+    given = [kind for kind in KINDS if kind in arrays]
+    if not given:
         raise PointsError(f"no array of points; accepted: at least one of {', '.join(KINDS)}")
     if ("known" in arrays) != ("known_sdf" in arrays):
         raise PointsError("known and known_sdf stand only together")
-    classes = {kind: _npz_class(kind, arrays) for kind in KINDS}
-    return PointFile(classes, _npz_pose(arrays))
+    pose = arrays.get("world_from_object")
+    if pose is not None:
+        pose = frozen("world_from_object", pose, (4, 4), error=PoseError)
+        pose = nearest_rigid("world_from_object", pose[None])[0]
+    parts = [_npz_part(kind, arrays) for kind in given]
+    kinds, points, sdf, steps = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return PointFile(kinds, points, sdf, steps, pose)
 
 
-def _npz_class(kind: str, arrays: dict[str, Any]) -> PointClass:
-    if kind not in arrays:
-        return PointClass()
+def _npz_part(kind: str, arrays: dict[str, Any]) -> tuple[np.ndarray, ...]:
+    """Kinds, points, signed distances and steps of one array of points."""
     points = frozen(kind, arrays[kind], (None, 3))
-    sdf = arrays["known_sdf"] if kind == "known" else np.zeros(len(points))
-    name = f"{kind}_step"
-    steps = np.asarray(arrays.get(name, np.zeros(len(points), dtype=np.int64)))
-    if not np.issubdtype(steps.dtype, np.integer) or steps.shape != (len(points),):
+    nothing = np.zeros(len(points), dtype=np.int64)
+    sdf = frozen("known_sdf", arrays["known_sdf"] if kind == "known" else nothing, nothing.shape)
+    steps = np.asarray(arrays.get(f"{kind}_step", nothing))
+    if not np.issubdtype(steps.dtype, np.integer) or steps.shape != nothing.shape:
         raise PointsError(
-            f"{name} has type {steps.dtype} and shape {steps.shape}; accepted: integers, shape "
-            f"({len(points)},)"
+            f"{kind}_step has type {steps.dtype} and shape {steps.shape}; accepted: integers, "
+            f"shape {nothing.shape}"
         )
-    refused = (steps < 0) | (steps > LAST_STEP)
-    if refused.any():
-        row = int(np.argmax(refused))
-        raise PointsError(f"{name}[{row}] is {steps[row]}; accepted: 0 to {LAST_STEP}")
-    return PointClass(points, frozen("known_sdf", sdf, (len(points),)), steps.astype(np.int64))
-
-
-def _npz_pose(arrays: dict[str, Any]) -> FloatArray | None:
-    if "world_from_object" not in arrays:
-        return None
-    pose = frozen("world_from_object", arrays["world_from_object"], (4, 4), error=PoseError)
-    return nearest_rigid("world_from_object", pose[None])[0]
+    return np.full(len(points), kind), points, sdf, steps.astype(np.int64)
 
 
 def _read_csv(path: Path) -> PointFile:
-    columns: dict[str, tuple[list[Any], list[Any], list[Any]]] = {k: ([], [], []) for k in KINDS}
+    import pandas as pd
+
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            header = [name.strip() for name in reader.fieldnames or []]
-            reader.fieldnames = header
-            named = set(header)
-            if not {"x", "y", "z", "kind"} <= named <= set(_COLUMNS) or len(named) < len(header):
-                raise PointsError(
-                    f"line 1 is {','.join(header)[:_LONGEST_TEXT]!r}; accepted: the header "
-                    "x,y,z,kind[,sdf][,step], each column once"
-                )
-            for row in reader:
-                try:
-                    kind, *values = _csv_row(row)
-                except ValueError as error:
-                    raise PointsError(f"line {reader.line_num}: {error}") from None
-                for column, value in zip(columns[kind], values, strict=True):
-                    column.append(value)
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise PointsError(f"not a readable .csv file ({error})") from None
-    return PointFile(
-        {
-            kind: PointClass(
-                frozen("points", np.reshape(points, (-1, 3)), (None, 3)),
-                np.array(sdf, dtype=np.float64),
-                np.array(steps, dtype=np.int64),
-            )
-            for kind, (points, sdf, steps) in columns.items()
-        }
-    )
-
-
-def _csv_row(row: dict[Any, Any]) -> tuple[str, list[float], float, int]:
-    """Kind, point, signed distance and step of a row; ValueError for what is wrong."""
-    if None in row or None in row.values():
-        raise ValueError("it has another number of fields than the header")
-    kind = row["kind"].strip()
-    if kind not in KINDS:
-        raise ValueError(f"kind is {kind[:_LONGEST_TEXT]!r}; accepted: {', '.join(KINDS)}")
-    given = row.get("sdf", "").strip()
-    sdf = _number(given or "0", "sdf")
-    if not given and kind == "known":
-        raise ValueError("a known point needs an sdf")
-    if given and (kind in ("free", "occupied") or (kind == "surface" and sdf != 0.0)):
-        raise ValueError(f"a {kind} point has sdf {sdf:g}; accepted: nothing")
-    step = _number(row.get("step", "").strip() or "0", "step")
-    if step != int(step) or not 0 <= step <= LAST_STEP:
-        raise ValueError(f"step is {step:.20g}; accepted: an integer from 0 to {LAST_STEP}")
-    return kind, [_number(row[axis], axis) for axis in "xyz"], sdf, int(step)
-
-
-def _number(text: str, name: str) -> float:
+        with warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):
+            table = pd.read_csv(path, dtype=object, skipinitialspace=True, index_col=False)
+    except (ValueError, pd.errors.ParserWarning) as error:
+        raise PointsError(f"not a readable .csv file ({' '.join(str(error).split())})") from None
+    table.columns = table.columns.str.strip()
+    if not set("xyz") | {"kind"} <= set(table.columns) <= set(_COLUMNS):
+        raise PointsError(
+            f"its columns are {', '.join(table.columns)}; accepted: x, y, z, kind[, sdf][, step]"
+        )
+    table = table.reindex(columns=_COLUMNS)
+    kinds = table.pop("kind").astype(str).str.strip().to_numpy()
+    known, given = kinds == "known", table["sdf"].notna().to_numpy()
     try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"{name} is {text[:_LONGEST_TEXT]!r}; accepted: a finite number")
-    return value
+        numbers = table.fillna({"sdf": 0.0, "step": 0.0}).to_numpy(float)
+    except ValueError as error:
+        raise PointsError(f"{error}; accepted: numbers") from None
+    points, sdf, steps = numbers[:, :3], numbers[:, 3], numbers[:, 4]
+    for wrong, what in (
+        (~np.isin(kinds, KINDS), f"kind is none of {', '.join(KINDS)}"),
+        (~np.isfinite(numbers).all(axis=1), "one of x, y, z, sdf and step is not a finite number"),
+        (known & ~given, "a known point needs an sdf"),
+        (~known & (sdf != 0.0), "a point that is not known has an sdf"),
+        (steps % 1.0 != 0.0, "step is not an integer"),
+    ):
+        if wrong.any():
+            raise PointsError(f"row {np.argmax(wrong) + 1}: {what}")
+    return PointFile(kinds, points, sdf, steps.astype(np.int64))
 
 
 def _read_surface(path: Path) -> PointFile:
@@ -288,9 +207,8 @@ def _read_surface(path: Path) -> PointFile:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise PointsError(f"not a readable .{kind} file ({reason[:200]})") from None
     points = frozen("surface", vertices, (None, 3))
-    nothing = {kind: PointClass() for kind in KINDS}
-    steps = np.zeros(len(points), dtype=np.int64)
-    return PointFile({**nothing, "surface": PointClass(points, np.zeros(len(points)), steps)})
+    nothing = np.zeros(len(points), dtype=np.int64)
+    return PointFile(np.full(len(points), "surface"), points, nothing.astype(float), nothing)
 
 
 def _vertices(geometry: Any) -> FloatArray:
@@ -308,8 +226,5 @@ def _vertices(geometry: Any) -> FloatArray:
 _READERS: dict[str, Callable[[Path], PointFile]] = {
     ".npz": _read_npz,
     ".csv": _read_csv,
-    ".ply": _read_surface,
-    ".off": _read_surface,
-    ".xyz": _read_surface,
-    ".stl": _read_surface,
+    **dict.fromkeys((".ply", ".off", ".xyz", ".stl"), _read_surface),
 }

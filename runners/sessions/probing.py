@@ -14,7 +14,7 @@ from chsel.next_probe.action_lattice import (
     forward_actions,
     straight_actions,
 )
-from chsel.next_probe.decision_problem import Actions, HandShape
+from chsel.next_probe.decision_problem import Actions
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply, inverse
@@ -22,7 +22,6 @@ from chsel.problem.sdf_grid import mesh_sdf
 from replay.events import Probe
 from runners.sessions.configurations import WORKSPACE, Configuration, find_configuration
 from runners.sessions.faults import Faults, FaultSettings, probed_mesh
-from runners.sessions.free_space import box_shell, floor_slab, swept_voxels
 from runners.sessions.gripper import X_REST, Engine, Gripper
 from runners.sessions.placement import laid_down
 from runners.sessions.probing_hand import (
@@ -37,6 +36,9 @@ from runners.sessions.session import require_available
 
 if TYPE_CHECKING:
     import trimesh
+
+SLAB_MARGIN = 0.15  # m: by which the floor slab is wider than the object
+SLAB_LAYERS = 2
 
 
 def open_probing(
@@ -72,12 +74,11 @@ class ProbingSession:
         seed: int,
         hand: ProbingHand,
     ) -> None:
-        """mesh: the registered one, in its frame, metres. seed: of noise and faults.
+        """mesh: the registered one, in its frame, metres. hand: that of the engine.
 
-        hand: that of the engine. Raises SettingError if nothing of it is deep enough to sweep.
+        Raises SettingError if nothing of the hand is deep enough to sweep.
         """
-        self.configuration = configuration
-        self.settings = settings
+        self.configuration, self.settings = configuration, settings
         self.workspace = choose_workspace(configuration, settings)
         self.free_resolution = settings.free_resolution
         self.world_from_object: FloatArray | None = engine.world_from_object
@@ -86,7 +87,7 @@ class ProbingSession:
         self.initial_points = KnownPoints(
             free=self._voxels.add(self._boundary(mesh, engine.world_from_object))
         )
-        self._hand = hand
+        self.hand = hand.shape  # in its own frame, where it probes along z
         self._interior = hand.interior_points(settings.interior_spacing, settings.interior_depth)
         if len(self._interior) == 0:
             raise SettingError(
@@ -95,18 +96,11 @@ class ProbingSession:
             )
         self._offered: Actions | None = None
         self._available = np.zeros(0, dtype=bool)
-        self._gripper = Gripper(engine, settings, seed)
-        self._engine = engine
+        self._engine, self._gripper = engine, Gripper(engine, settings, seed)
         self._faults: Faults | None = None
         if settings.faults != FaultSettings():
-            self._faults = Faults(
-                settings.faults,
-                probed_mesh(mesh, settings.faults),
-                engine.world_from_object,
-                self._voxels,
-                self.workspace,
-                seed,
-            )
+            probed, pose = probed_mesh(mesh, settings.faults), engine.world_from_object
+            self._faults = Faults(settings.faults, probed, pose, self._voxels, self.workspace, seed)
 
     def probes(self) -> Iterator[Probe]:
         """Move before the object, push, return; once for every point of the grid."""
@@ -116,11 +110,6 @@ class ProbingSession:
             self._gripper.push()
             self._gripper.withdraw()
             yield self._probe(step)
-
-    @property
-    def hand(self) -> HandShape:
-        """Of the engine, in its own frame, where it probes along z."""
-        return self._hand.shape
 
     def offer(self, settings: ActionSettings) -> Actions:
         """The probes that can be chosen from; see `Steerable`."""
@@ -157,11 +146,10 @@ class ProbingSession:
 
     def _probe(self, step: int, rotation: FloatArray = ROTATION) -> Probe:
         """What the gripper has done since it last forgot, turned by a rotation world_from_hand."""
-        path = np.array(self._gripper.path)
-        ends = np.array(self._gripper.ends)
-        contacts = np.array(self._gripper.contacts).reshape(-1, 3)
-        normals = np.array(self._gripper.normals).reshape(-1, 3)
-        swept = path if self.settings.sweep == "mini_steps" else ends
+        done = self._gripper
+        ends, contacts = np.array(done.ends), np.array(done.contacts).reshape(-1, 3)
+        normals = np.array(done.normals).reshape(-1, 3)
+        swept = np.array(done.path) if self.settings.sweep == "mini_steps" else ends
         interior = self._interior @ turned_from_forward(rotation).T
         free = self._voxels.add(swept_voxels(self._voxels.lattice, interior, swept))
         if self._faults is not None:
@@ -179,22 +167,41 @@ class ProbingSession:
     def _boundary(self, mesh: trimesh.Trimesh, world_from_object: FloatArray) -> FloatArray:
         """Centres (N, 3) of the voxels where the object is known not to be."""
         lattice, chosen = self._voxels.lattice, self.settings.boundary
-        points = np.zeros((0, 3))
-        if chosen in ("box_shell", "both"):
-            points = np.concatenate([points, box_shell(lattice, self.workspace)])
-        if chosen in ("floor_slab", "both"):
-            vertices = apply(world_from_object, np.asarray(mesh.vertices))
-            points = np.concatenate([points, floor_slab(lattice, vertices)])
+        vertices = apply(world_from_object, np.asarray(mesh.vertices))
+        parts = {"box_shell": box_shell(lattice, self.workspace)}
+        parts["floor_slab"] = floor_slab(lattice, vertices)
+        points = np.concatenate([part for name, part in parts.items() if chosen in (name, "both")])
         # Some configurations reach out of their workspace; free points within the object would lie.
-        in_object = apply(inverse(world_from_object), points)
-        lower, upper = np.asarray(mesh.bounds)
-        beside = ((in_object < lower) | (in_object > upper)).any(axis=1)
-        asked = ~beside if mesh.is_watertight else np.ones(len(points), dtype=bool)
-        inside = np.zeros(len(points), dtype=bool)
-        inside[asked] = mesh_sdf(mesh, in_object[asked])[0] <= 0.0
-        return points[~inside]
+        return points[mesh_sdf(mesh, apply(inverse(world_from_object), points))[0] > 0.0]
 
 
 def choose_workspace(configuration: Configuration, settings: ProbingSettings) -> Workspace:
     """The box in which the object is sought."""
     return WORKSPACE if settings.workspace == "paper" else configuration.workspace
+
+
+def floor_slab(lattice: Lattice, vertices: FloatArray) -> FloatArray:
+    """Centres of the lattice's lowest layers, below the floor, under and around vertices (V, 3)."""
+    low = lattice.voxels(vertices.min(axis=0, keepdims=True) - SLAB_MARGIN)[0]
+    high = lattice.voxels(vertices.max(axis=0, keepdims=True) + SLAB_MARGIN)[0]
+    low[2], high[2] = 0, SLAB_LAYERS - 1
+    return lattice.centres(low + np.argwhere(np.ones(high - low + 1, dtype=bool)))
+
+
+def box_shell(lattice: Lattice, workspace: Workspace) -> FloatArray:
+    """Centres of one layer of voxels on the six faces of the workspace."""
+    last = lattice.voxels(workspace.bounds[1:])[0]
+    shell = np.ones(last + 1, dtype=bool)
+    shell[1:-1, 1:-1, 1:-1] = False
+    return lattice.centres(np.argwhere(shell))
+
+
+def swept_voxels(lattice: Lattice, interior: FloatArray, positions: FloatArray) -> FloatArray:
+    """Centres of the voxels that interior (M, 3) meets at any of the hand's positions (P, 3)."""
+    bounds = np.array([positions.min(axis=0), positions.max(axis=0)])
+    bounds += [interior.min(axis=0), interior.max(axis=0)]
+    low, high = lattice.voxels(bounds)
+    met = np.zeros(high - low + 1, dtype=bool)
+    for position in np.unique(positions, axis=0):
+        met[tuple((lattice.voxels(interior + position) - low).T)] = True
+    return lattice.centres(low + np.argwhere(met))

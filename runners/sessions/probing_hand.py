@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 # of the hand (hand y) lies along world y.
 ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 LARGEST = 0.5  # m: extent of a hand along any axis
-MOST_SURFACE = 1.0  # m^2: of all parts, probed with a point to every square millimetre
-MOST_FACES = 20_000  # of the convex hulls of all parts
 _FLUSH = 1e-9  # m: of two solids that share a face
 
 
@@ -51,7 +49,6 @@ class ProbingHand:
 
     def __init__(self, solids: Sequence[trimesh.Trimesh]) -> None:
         self.solids = tuple(solids)
-        self._surfaces: dict[float, FloatArray] = {}
 
     @cached_property
     def shape(self) -> HandShape:
@@ -61,12 +58,11 @@ class ProbingHand:
         joined: Any = trimesh.util.concatenate(list(self.solids))
         return HandShape(np.asarray(joined.vertices) @ ROTATION, joined.faces)
 
+    @cache  # noqa: B019  (there are few hands in a process)
     def surface_points(self, spacing: float) -> FloatArray:
         """Points (S, 3) that cover the surface about `spacing` apart, all corners among them."""
-        if spacing not in self._surfaces:
-            parts = [self._covering(index, spacing) for index in range(len(self.solids))]
-            self._surfaces[spacing] = np.concatenate(parts)
-        return self._surfaces[spacing]
+        parts = [self._covering(index, spacing) for index in range(len(self.solids))]
+        return np.concatenate(parts)
 
     def interior_points(self, spacing: float, depth: float) -> FloatArray:
         """Nodes (M, 3) of a lattice through the origin that lie deeper than `depth` in a solid."""
@@ -110,7 +106,7 @@ def panda_hand() -> ProbingHand:
 def open_hand(described: DescribedHand) -> ProbingHand:
     """The hand of a session.
 
-    Raises SettingError for a URDF that cannot be used, and for a hand that is too large.
+    Raises SettingError for a URDF that cannot be used, and for a hand that is too long.
     """
     import trimesh
 
@@ -120,19 +116,13 @@ def open_hand(described: DescribedHand) -> ProbingHand:
         return panda_hand()
     rig = HandRig(frame="hand", boxes=described.boxes, urdf=described.urdf, root=described.root)
     parts = [np.asarray(part.vertices) @ ROTATION.T for part in HandModel(rig).parts()]
-    hulls = [trimesh.convex.convex_hull(vertices) for vertices in parts]
-    source = f" of {described.urdf}" if described.urdf else ""
-    for what, value, most in (
-        ("m, its largest extent", np.ptp(np.concatenate(parts), axis=0).max(), LARGEST),
-        ("m^2 of surface", sum(hull.area for hull in hulls), MOST_SURFACE),
-        ("faces", sum(len(hull.faces) for hull in hulls), MOST_FACES),
-    ):
-        if value > most:
-            raise SettingError(
-                f"the hand{source} has {value:.6g} {what}; accepted: at most {most:g}. Choose the "
-                "link of the gripper as hand.root, without the arm, or simpler shapes"
-            )
-    return ProbingHand(hulls)
+    extent = np.ptp(np.concatenate(parts), axis=0).max()
+    if extent > LARGEST:
+        raise SettingError(
+            f"the hand is {extent:.6g} m long; accepted: at most {LARGEST:g}. Choose the link of "
+            "the gripper as hand.root, without the arm"
+        )
+    return ProbingHand([trimesh.convex.convex_hull(vertices) for vertices in parts])
 
 
 def turned_from_forward(rotation: FloatArray) -> FloatArray:

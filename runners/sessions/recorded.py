@@ -14,7 +14,7 @@ from chsel.next_probe.action_lattice import ActionSettings, straight_actions
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
-from chsel.problem.points import KnownPoints, Lattice, Workspace, check_points
+from chsel.problem.points import KnownPoints, Lattice, check_points
 from chsel.problem.poses import apply, nearest_rigid
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
@@ -51,29 +51,21 @@ class RecordedSession:
     def __init__(self, settings: RecordedSettings) -> None:
         assert settings.path is not None
         recording = read_recording(settings.path)
-        self._recording = recording
-        self.recorded = recording.start
-        self.workspace = self.recorded.workspace
-        self.free_resolution = self.recorded.free_resolution
-        self.world_from_object = self.recorded.world_from_object
-        self.initial_points = self.recorded.initial_points
-        self._probes = recording.probes
+        start = recording.start
+        self._recording, self.recorded, self._probes = recording, start, recording.probes
+        self.workspace, self.free_resolution = start.workspace, start.free_resolution
+        self.world_from_object, self.initial_points = start.world_from_object, start.initial_points
         self.count = len(self._probes)
-        self._check(settings.path)
-        self.start = Start(
-            self._rule("start_contacts", settings.start_contacts),
-            self._rule("start_probe", settings.start_probe),
-        )
-
-    def _check(self, path: str) -> None:
-        """Before any work; warnings are given when the points become known."""
-        new = (probe.new_points for probe in self._probes)
+        self._config: Mapping[str, Any] = start.config.get("session", {})
+        chosen = {name: self._config.get(name) or 0 for name in ("start_contacts", "start_probe")}
+        chosen |= {name: value for name, value in vars(settings).items() if value is not None}
+        self.start = Start(chosen["start_contacts"], chosen["start_probe"])
+        new = [probe.new_points for probe in self._probes]
         every = KnownPoints.joined([self.initial_points, *new])
-        diameter = self.recorded.sdf.diameter
-        try:
-            check_points(every, diameter, self.free_resolution, self.workspace)
+        try:  # before any work; warnings are given when the points become known
+            check_points(every, start.sdf.diameter, self.free_resolution, self.workspace)
         except PointsError as error:
-            raise PointsError(f"recording {path}: {error}") from None
+            raise PointsError(f"recording {settings.path}: {error}") from None
 
     def probes(self) -> Iterator[Probe]:
         """The recorded probes in their order."""
@@ -95,7 +87,7 @@ class RecordedSession:
                 "cannot be chosen; accepted: a session of kind simulated or kinematic, or of "
                 "sensors with solid parts of the hand in the rig"
             )
-        described = build_settings(DescribedHand, self._config("hand", {}), "session.hand")
+        described = build_settings(DescribedHand, self._config.get("hand", {}), "session.hand")
         return open_hand(described).shape
 
     def offer(self, settings: ActionSettings) -> Actions:
@@ -116,11 +108,12 @@ class RecordedSession:
 
     @cached_property
     def _actions(self) -> RecordedActions:
-        ours, hand = self.recorded.session in _OF_GRIPPERS, self.hand
-        depth = self._config("interior_depth", ProbingSettings.interior_depth) if ours else 0.0
-        workspace, resolution = self.workspace, self.free_resolution
+        hand, depth = self.hand, 0.0
+        if self.recorded.session in _OF_GRIPPERS:
+            depth = self._config.get("interior_depth", ProbingSettings.interior_depth)
+        lattice = Lattice(self.workspace.lower, self.free_resolution)
         try:
-            return RecordedActions(self._probes, hand, workspace, resolution, depth=depth)
+            return RecordedActions(self._probes, hand, lattice, depth=depth)
         except (PoseError, SessionError) as error:
             raise SessionError(f"recording {self._recording.path}: {error}") from None
 
@@ -143,17 +136,6 @@ class RecordedSession:
         """The steps of the session with the points that are new in each."""
         return ((probe.step, probe.new_points) for probe in self._probes)
 
-    def _rule(self, name: str, chosen: int | None) -> int:
-        """What was chosen, or else what the recording says; 0 if it says nothing sensible."""
-        value = self._config(name, 0) if chosen is None else chosen
-        return value if isinstance(value, int) else 0
-
-    def _config(self, name: str, default: Any) -> Any:
-        """A setting of the recorded session, of the type of the default, else the default."""
-        session = self.recorded.config.get("session")
-        recorded = session.get(name, default) if isinstance(session, Mapping) else default
-        return recorded if isinstance(recorded, type(default)) else default
-
     def close(self) -> None:
         """Nothing is held open."""
 
@@ -163,8 +145,6 @@ _AT_START = 0.002  # m: within which a push has not begun
 _SHORTEST = 0.010  # m: of the longest push of a recording
 _FINE = 5.0  # of a voxel's side: steps in which a path is swept
 _NODES = 3.0  # of a voxel's side: nodes of the hand's interior
-_MOST_VOXELS = 100_000_000
-_MOST_NODES = 2e6  # of the hand's interior
 _TOGETHER = 200  # poses that are swept at once
 
 
@@ -177,19 +157,13 @@ class RecordedActions:
     """
 
     def __init__(
-        self,
-        probes: Sequence[Probe],
-        hand: HandShape,
-        workspace: Workspace,
-        free_resolution: float,
-        *,
-        depth: float,
+        self, probes: Sequence[Probe], hand: HandShape, lattice: Lattice, *, depth: float
     ) -> None:
-        """free_resolution: side of a voxel, metres. depth: of the hand's interior that sweeps.
+        """lattice: of the voxels of free space. depth: of the hand's interior that sweeps, metres.
 
         Raises SessionError for probes without a push along the hand's z axis.
         """
-        self._probes, self._resolution = list(probes), free_resolution
+        self._probes, self._lattice = list(probes), lattice
         pushes = [_push(probe) for probe in self._probes]
         self._length = max((length for _, length in pushes), default=0.0)
         if self._length < _SHORTEST:
@@ -199,14 +173,13 @@ class RecordedActions:
             )
         self._starts = np.array([start for start, _ in pushes])  # (A, 4, 4)
         self.available: BoolArray = np.ones(len(self._probes), dtype=bool)
-        self._interior = _interior(hand, free_resolution / _NODES, depth)  # (M, 3), hand frame
+        self._interior = _interior(hand, lattice.spacing / _NODES, depth)  # (M, 3), hand frame
         self._radius = float(np.sqrt((np.asarray(hand.vertices) ** 2).sum(axis=1)).max())
         free = [probe.new_points.free for probe in self._probes]
         self._free = np.concatenate(free)  # (N, 3), in the order of the recording
         self._first = np.repeat(np.arange(len(free)), [len(points) for points in free])  # (N,)
         self._given = np.zeros(len(self._free), dtype=bool)
-        self._lattice = Lattice(workspace.lower, free_resolution)
-        self._voxels = self._lattice.voxels(self._free)  # (N, 3)
+        self._voxels = lattice.voxels(self._free)  # (N, 3)
 
     def offer(self, settings: ActionSettings) -> Actions:
         """An action for each probe, as long as the longest push of them; reach does not matter."""
@@ -229,22 +202,16 @@ class RecordedActions:
         """Which of voxels (N, 3) the hand's interior meets on a path (P, 4, 4)."""
         if len(voxels) == 0 or len(self._interior) == 0:
             return np.zeros(len(voxels), dtype=bool)
-        low, high = voxels.min(axis=0), voxels.max(axis=0)
-        shape = high - low + 1
-        if np.prod(shape, dtype=float) > _MOST_VOXELS:
-            raise SessionError(
-                f"free points span more than {_MOST_VOXELS} voxels of "
-                f"{self._resolution:g} m; accepted: fewer"
-            )
+        low = voxels.min(axis=0)
+        shape = voxels.max(axis=0) - low + 1
         met = np.zeros(shape, dtype=bool)
-        poses = poses_between(path, step=self._resolution / _FINE, radius=self._radius)
+        poses = poses_between(path, step=self._lattice.spacing / _FINE, radius=self._radius)
         for first in range(0, len(poses), _TOGETHER):
             places = apply(poses[first : first + _TOGETHER], self._interior).reshape(-1, 3)
             at = self._lattice.voxels(places) - low
             at = at[((at >= 0) & (at < shape)).all(axis=1)]
             met[tuple(at.T)] = True
-        swept: BoolArray = met[tuple((voxels - low).T)]
-        return swept
+        return np.asarray(met[tuple((voxels - low).T)])
 
 
 def _push(probe: Probe) -> tuple[FloatArray, float]:
@@ -274,12 +241,6 @@ def _interior(hand: HandShape, spacing: float, depth: float) -> FloatArray:
 
     mesh = trimesh.Trimesh(hand.vertices, hand.faces, process=False)
     bodies = [body for body in mesh.split(only_watertight=False) if body.is_watertight]
-    count = sum(float(np.prod(body.extents)) for body in bodies) / spacing**3
-    if count > _MOST_NODES:
-        raise SessionError(
-            f"the hand is {count:.3g} times as large as {spacing:.3g} m cubed; "
-            f"accepted: at most {_MOST_NODES:g} times"
-        )
     deep = [np.zeros((0, 3))]
     for body in bodies:
         nodes = interior_lattice(body, spacing)

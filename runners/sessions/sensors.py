@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -29,12 +29,12 @@ from runners.sensors.pose_file import beside, read_pose
 from runners.sensors.rig import Rig
 from runners.sensors.second_pass import SecondPass
 from runners.sensors.session_report import LogWarnings, Report
-from runners.sessions.free_space import box_shell
-from runners.sessions.session import Progress, Session, SessionEvent, unwatched
+from runners.sessions.probing import box_shell
+from runners.sessions.session import Session, SessionEvent
 
 NO_POSE = "none"
-_MEGABYTE = 2**20
-_MANY = 0.4  # of a camera's pixels at edges: rather a slanted surface, seen in few pixels
+_MANY_EDGES = 0.4  # of a camera's pixels: rather a slanted surface, seen in few pixels
+_MANY_OF_LABEL = 0.2  # of its pixels left out: rather a wrong label
 
 
 @dataclass(frozen=True)
@@ -61,32 +61,22 @@ class SensorsSettings(CheckedSettings):
             )
 
 
-def open_sensors(
-    settings: SensorsSettings, object_model: ObjectModel, seed: int, progress: Progress = unwatched
-) -> Session:
+def open_sensors(settings: SensorsSettings, object_model: ObjectModel, seed: int) -> Session:
     """The session of a log, or of a depth image. Raises SessionError if it cannot be used."""
     path = Path(settings.path or "").expanduser()
     if path.suffix.lower() in FRAME_SUFFIXES:
+        resolution, images = settings.free_resolution, settings.images
         return DepthFrameSession(
-            path,
-            settings.rig,
-            object_model,
-            free_resolution=settings.free_resolution,
-            images=settings.images,
+            path, settings.rig, object_model, free_resolution=resolution, images=images
         )
-    return SensorsSession(settings, seed, progress, diameter=object_model.diameter)
+    return SensorsSession(settings, seed, diameter=object_model.diameter)
 
 
 class SensorsSession:
     """Reads a log twice: what is small at once, images one after the other; see `Session`."""
 
     def __init__(
-        self,
-        settings: SensorsSettings,
-        seed: int,
-        progress: Progress = unwatched,
-        *,
-        diameter: float | None = None,
+        self, settings: SensorsSettings, seed: int, *, diameter: float | None = None
     ) -> None:
         """seed: of the choice of contact pixels. diameter: of the object, metres, where known.
 
@@ -99,40 +89,32 @@ class SensorsSession:
         self.free_resolution = settings.free_resolution
         self.world_from_object: FloatArray | None = None
         self._rig, self._seed, self._images = rig, seed, settings.images
-        self._progress, self._diameter = progress, diameter
-        self._opening = LogWarnings()
+        self._diameter, self._opening = diameter, LogWarnings()
         self._hand = HandModel(rig.hand) if rig.hand else None
         for text in self._hand.warnings if self._hand else ():
             self._opening.warn(text)
-        self._log = RawLog(path, progress=self._shown("looking for topics"))
+        self._log = RawLog(path)
         self._find_pose(path, settings.pose)
         joints = self._hand.joint_names if self._hand else ()
-        self._first_pass = FirstPass(
-            self._log, rig, joints, self._opening, self._shown("first pass over the log")
-        )
+        self._first_pass = FirstPass(self._log, rig, joints, self._opening, lambda *_: None)
         missing = [name for name in joints if name not in self._first_pass.joints.first()]
         if missing:
             self._opening.warn(f"joints without a value are at 0: {', '.join(missing)}")
         self.source = self._log.digest()
         self.count = len(self._first_pass.windows)
-        self.initial_points = KnownPoints(free=self._free_map()[1])
+        self._free = FreeMap(self.workspace, self.free_resolution)
+        if rig.boundary == "box_shell":
+            self._free.grid.at(box_shell(self._free.grid.lattice, self.workspace))
+        self.initial_points = KnownPoints(free=self._free.new())
         annotated = {*rig.annotations.exclude, *(add.probe for add in rig.annotations.contacts)}
         for step in sorted(annotated - {window.step for window in self._first_pass.windows}):
             self._opening.warn(f"the rig annotates probe {step}, which the log does not have")
 
     def probes(self) -> Iterator[SessionEvent]:
-        """The probes of the log, in their order; its images are read as they go."""
+        """The probes of the log, in their order, once; its images are read as they go."""
         rig, first_pass, warnings = self._rig, self._first_pass, LogWarnings(self._opening)
-        self.report.by_probe.clear()
-        cell = RobotCell(
-            rig.world,
-            first_pass.tree,
-            rig.clock.gap,
-            self._free_map()[0],
-            warnings,
-            rig.gate,
-            self._diameter,
-        )
+        tree, gap, gate = first_pass.tree, rig.clock.gap, rig.gate
+        cell = RobotCell(rig.world, tree, gap, self._free, warnings, gate, self._diameter)
         reading = SecondPass(
             rig, first_pass, cell, self.report, self._hand, seed=self._seed, images=self._images
         )
@@ -140,7 +122,7 @@ class SensorsSession:
         yield RigDescribed(-1, rig.name, self.source, hand)
         messages: Iterator[Received] = iter(())
         if first_pass.bulky:
-            messages = self._log.messages(first_pass.bulky, progress=self._shown("reading images"))
+            messages = self._log.messages(first_pass.bulky)
         yield from reading.events(in_time_order(messages, first_pass.clocks.time))
         reading.check()
         for text, count in self._log.faults.items():
@@ -148,7 +130,7 @@ class SensorsSession:
         for name, counts in self.report.total().items():
             if left_out := counts.left_out():
                 warnings.note(f"{name}: {left_out}")
-            if counts.edges > _MANY * counts.pixels:
+            if counts.edges > _MANY_EDGES * counts.pixels:
                 share = 100 * counts.edges // counts.pixels
                 warnings.warn(
                     f"{name}: {share} % of its pixels are left out as "
@@ -161,13 +143,6 @@ class SensorsSession:
     def close(self) -> None:
         """Nothing is held open."""
 
-    def _free_map(self) -> tuple[FreeMap, FloatArray]:
-        """A map in which the workspace's border is free, and the centres (N, 3) of its voxels."""
-        free = FreeMap(self.workspace, self.free_resolution)
-        if self._rig.boundary == "box_shell":
-            free.grid.at(box_shell(free.grid.lattice, self.workspace))
-        return free, free.new()
-
     def _find_pose(self, path: Path, chosen: str | None) -> None:
         """The true pose, if there is a file of it."""
         if chosen == NO_POSE:
@@ -176,17 +151,6 @@ class SensorsSession:
         if chosen or file.is_file():
             self.world_from_object = read_pose(file)
             self._opening.note(f"the true pose is that of {file.name}")
-
-    def _shown(self, stage: str) -> Callable[[int, int], None]:
-        """Progress of a stage in bytes, shown in megabytes."""
-
-        def show(done: int, total: int) -> None:
-            self._progress(f"{stage}, MB", done // _MEGABYTE, -(-total // _MEGABYTE))
-
-        return show
-
-
-_MANY = 0.2  # of a label's pixels left out: rather a wrong label
 
 
 class DepthFrameSession:
@@ -238,7 +202,7 @@ class DepthFrameSession:
         for sensor, counts in ((name, found.counts), ("label", label)):
             if counts is not None and (left_out := counts.left_out()):
                 yield "info", f"{sensor}: {left_out}"
-        if label is not None and label.small + label.far > _MANY * label.pixels:
+        if label is not None and label.small + label.far > _MANY_OF_LABEL * label.pixels:
             share = 100 * (label.small + label.far) // label.pixels
             yield (
                 "warning",
@@ -249,8 +213,7 @@ class DepthFrameSession:
         known = found.points.known
         outside = ((known < lower) | (known > upper)).any(axis=1).sum()
         if outside:
-            text = f"{outside} of {len(known)} surface points are out of the workspace"
-            yield "warning", text
+            yield "warning", f"{outside} of {len(known)} surface points are out of the workspace"
 
     def close(self) -> None:
         """Nothing is held open."""

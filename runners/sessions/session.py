@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Protocol, runtime_checkable
 
 from chsel.errors import SessionError
@@ -14,13 +14,6 @@ from replay.events import Logged, Probe, RigDescribed, SensorImage
 
 SessionEvent = RigDescribed | SensorImage | Logged | Probe
 """What a session yields: probes, and ahead of each what else is to be recorded about it."""
-
-Progress = Callable[[str, int, int], None]
-"""Told what is being done, and how much of how much of it is done."""
-
-
-def unwatched(stage: str, done: int, total: int) -> None:
-    """The progress where none is shown."""
 
 
 class Session(Protocol):

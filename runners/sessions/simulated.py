@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import tempfile
 from collections import deque
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -54,10 +53,13 @@ class PyBulletEngine:
         self._max_force = settings.max_force
         self._readings: deque[_Reading | None] = deque(maxlen=READINGS)
         self._began: _Reading | None = None
-        self._world: Any = _new_world()
+        self._world: Any = connect(
+            "use session=kinematic, the same session without a physics engine"
+        )
         # Every access to a function of the client makes it anew; these are called most.
         self._step, self._contacts = self._world.stepSimulation, self._world.getContactPoints
         try:
+            _set_up(self._world)
             with tempfile.TemporaryDirectory() as folder:
                 self.world_from_object = _settle(self._world, mesh, laid_down(mesh, configuration))
                 probed = probed_mesh(mesh, settings.faults)
@@ -111,8 +113,8 @@ class PyBulletEngine:
 
     def _read(self) -> _Reading | None:
         """The contact between hand and object after a step: where it presses hardest."""
-        records = self._contacts(self._hand, self._object)
-        records = [record for record in records if record[_FORCE] > 0.0]
+        touching = self._contacts(self._hand, self._object)
+        records = [record for record in touching if record[_FORCE] > 0.0]
         if not records:
             return None
         forces = [record[_FORCE] * np.array(record[_NORMAL_ON_B]) for record in records]
@@ -122,29 +124,24 @@ class PyBulletEngine:
         return _Reading(contact, normal, float(np.sqrt(total @ total)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Reading:
-    """contact (3,) on the object, its normal (3,) out of it, and the force on the hand, newtons."""
-
-    contact: FloatArray
-    normal: FloatArray
-    force: float
+class _Reading(NamedTuple):
+    contact: FloatArray  # (3,), on the object
+    normal: FloatArray  # (3,), out of it
+    force: float  # on the hand, newtons
 
 
 # Where a contact record of PyBullet has what; B is the object.
 _POINT_ON_B, _NORMAL_ON_B, _DISTANCE, _FORCE = 6, 7, 8, 9
 
 
-def _new_world() -> Any:
-    """A world of its own with a floor; SessionError where PyBullet is not installed."""
-    world = connect("use session=kinematic, the same session without a physics engine")
+def _set_up(world: Any) -> None:
+    """Time steps and floor of a new world."""
     world.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
     world.setTimeStep(TIME_STEP)
     floor = world.createMultiBody(0, world.createCollisionShape(world.GEOM_PLANE))
     world.changeDynamics(
         floor, -1, lateralFriction=FLOOR_FRICTION, spinningFriction=FLOOR_SPINNING_FRICTION
     )
-    return world
 
 
 def _settle(world: Any, mesh: trimesh.Trimesh, laid: FloatArray) -> FloatArray:

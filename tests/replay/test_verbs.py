@@ -8,15 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from chsel.errors import ChselError, MeshError, PointsError, SessionError, SettingError
+from chsel.errors import MeshError, SessionError, SettingError
 from chsel.problem.mesh import load_mesh
 from replay.__main__ import main
 from replay.arguments import chosen_steps
 from replay.verbs import ALIASES, VERBS
 from runners.sensors.depth_frame import read_depth_frame
 from runners.sensors.pose_file import read_pose
-from runners.sessions.points import read_points
-from runners.sessions.problem_source import open_source
 from tests.tools.verb_arguments import verb_arguments
 
 
@@ -113,11 +111,8 @@ def test_a_verb_refuses_what_is_no_file_in_one_line(tmp_path, verb, kind, capsys
 def test_readers_refuse_what_is_no_file(tmp_path, kind):
     readers = {
         "a.ply": (load_mesh, MeshError),
-        "a.npz": (read_points, PointsError),
-        "b.csv": (read_points, PointsError),
         "c.yaml": (read_pose, SessionError),
         "d.yaml": (read_depth_frame, SessionError),
-        "e.mcap": (lambda path: open_source(path, {}, {}, tmp_path, 0), ChselError),
     }
     for name, (read, error) in readers.items():
         path = special(tmp_path, kind, name)

@@ -14,29 +14,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from chsel.errors import SettingError
-from replay.__main__ import main as replay
 from runners import evaluate, plausible, probe, real
 from runners.command.arguments import hydra_arguments, quoted
 from tests.runners.in_process import run
 
-NAMES = (
-    "a,b [1].obj",
-    "it's 'so'",
-    "two words",
-    "Prüfkörper",
-    "物体",
-    "(a)",
-    "a\\'b",
-    "a#b",
-)
-SHORT = (
-    "recording=mcap",
-    "recording.snapshot_interval=0",
-    "method=chsel",
-    "method.descent.restarts=1",
-    "method.descent.iterations=5",
-    "method.emitter.iterations=2",
-)
+NAMES = ("a,b [1].obj", "it's 'so'", "Prüfkörper", "a\\'b", "a#b")
+SHORT = ("recording=mcap", "method=gradient_descent", "method.descent.restarts=1")
 COARSE = (
     "definition.epsilon=0.01",
     "definition.grid.rotations=200",
@@ -55,13 +38,13 @@ def value_of(word: str) -> object:
     return OmegaConf.to_container(config, resolve=True)["path"]  # type: ignore[index,call-overload]
 
 
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("key", ["object.path", "++session.hand.urdf", "+outside.x", "logs"])
-def test_a_path_reaches_the_configuration_as_typed(key: str, name: str) -> None:
-    (word,) = hydra_arguments("probe", [f"{key}={name}"])
-    assert word.startswith(f"{key}=")
-    assert value_of(word) == name
-    assert value_of(f"x={quoted(name)}") == name
+def test_a_path_reaches_the_configuration_as_typed() -> None:
+    for name in NAMES:
+        for key in ("object.path", "++session.hand.urdf", "+outside.x"):
+            (word,) = hydra_arguments("probe", [f"{key}={name}"])
+            assert word.startswith(f"{key}=")
+            assert value_of(word) == name
+        assert value_of(f"x={quoted(name)}") == name
 
 
 def test_the_home_folder_is_put_in_and_what_hydra_reads_stays(
@@ -109,24 +92,10 @@ def test_a_session_of_strange_files_runs_from_the_command_to_the_replay(
     assert (done.returncode, done.stderr) == (0, "")
     (folder,) = (home / "läufe [1],x" / "probe").iterdir()
     assert json.loads((folder / "summary.json").read_text())["outcome"] == "finished"
-    drawn = home / "drawn.rrd"
-    assert replay(["view", str(folder / "recording.mcap"), "--save=~/drawn.rrd"]) == 0
-    assert drawn.stat().st_size > 10_000
-
     recording = shutil.copy(folder / "recording.mcap", home / "x=1,[2].mcap")
     done = run(plausible.main, Path(recording).name, *COARSE, "out=~/s,1")
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
     assert list((home / "s,1").iterdir())
-
-
-def test_a_sweep_over_files_and_seeds(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(home)
-    shutil.copy(home / "Prüf körper,1.npz", "b.npz")
-    given = ["session=points", "object=mesh", "object.path=~/mesh.obj", *SHORT]
-    done = run(probe.main, "-m", "seed=0,1", *given, 'session.path="Prüf körper,1.npz",b.npz')
-    assert (done.returncode, done.stderr) == (0, "")
-    finished = [json.loads(path.read_text()) for path in home.glob("logs/probe/*/summary.json")]
-    assert sorted(one["seed"] for one in finished) == [0, 0, 1, 1]
 
 
 def test_words_without_a_key_get_that_of_the_command(
@@ -157,7 +126,6 @@ def test_any_key_of_an_open_group_is_taken() -> None:
     ("word", "message"),
     [
         ("settings.chsel.archive.bins=x", "settings.chsel.archive.bins is 'x'; accepted: "),
-        ("settings={chsel: {archive: {bins: x}}}", "settings.chsel.archive.bins is 'x'; "),
         ("settings={chsl: {archive: {bins: 20}}}", "settings of a method is 'chsl'; accepted: "),
         ("settings=null", "settings is None; accepted: a group of settings by method"),
     ],

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import resource
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -94,37 +93,6 @@ def test_a_disk_that_is_full_for_the_pictures_alone_is_told(
     assert only_error(errors) == (
         f"error: recording {path} cannot be written: the disk may be full"
     )
-
-
-def test_a_folder_that_is_removed_during_the_run_is_noticed(
-    session: tuple[str, ...], tmp_path: Path
-) -> None:
-    process = start(tmp_path, *session, "recording=both")
-    assert process.stdout is not None
-    for line in process.stdout:
-        if line.startswith("probe "):
-            folder = run_folder(tmp_path)
-            shutil.rmtree(folder)
-            break
-    output, errors = process.communicate(timeout=TIMEOUT)
-    assert process.returncode == 2
-    assert only_error(errors) == (
-        f"error: recording {folder / 'recording.mcap'} was removed while it was written"
-    )
-    assert reported_probes(output) < PROBES - 1  # it did not go on to the end
-    assert not folder.exists()
-
-
-def test_two_runs_at_once_write_two_whole_and_equal_recordings(
-    session: tuple[str, ...], tmp_path: Path
-) -> None:
-    processes = [start(tmp_path, *session, "recording=mcap") for _ in range(2)]
-    for process in processes:
-        _, errors = process.communicate(timeout=TIMEOUT)
-        assert (process.returncode, errors) == (0, "")
-    one, other = sorted(tmp_path.rglob("recording.mcap"))
-    assert len(read_recording(one).steps) == PROBES
-    assert one.read_bytes() == other.read_bytes()
 
 
 def test_output_that_nobody_reads_ends_the_run_with_a_whole_recording(

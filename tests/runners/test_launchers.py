@@ -16,36 +16,8 @@ from replay.comparing.choices import recorded_method
 from replay.mcap.reader import read_recording
 
 pytestmark = pytest.mark.slow
-PLUGINS = {
-    "joblib": "hydra_joblib_launcher",
-    "submitit_local": "hydra_submitit_launcher",
-    "submitit_slurm": "hydra_submitit_launcher",
-}
+PLUGINS = {"joblib": "hydra_joblib_launcher", "submitit_local": "hydra_submitit_launcher"}
 SMALL = ("object=mustard", "session=kinematic", "method=icp", "recording=mcap")
-# What submitit asks of SLURM, by a cluster of one machine that starts every job at once.
-CLUSTER = {
-    "sbatch": """#!/usr/bin/env bash
-set -eu
-file=${*: -1}
-export SLURM_JOB_NUM_NODES=1 SLURM_NTASKS=1 SLURM_PROCID=0 SLURM_LOCALID=0 SLURM_NODEID=0
-export SLURM_ARRAY_JOB_ID=7 SLURM_JOB_NODELIST=here
-last=$(sed -n 's/^#SBATCH --array=0-\\([0-9]*\\).*/\\1/p' "$file")
-for task in $(seq 0 "$last"); do
-    SLURM_JOB_ID=7_$task SLURM_ARRAY_TASK_ID=$task setsid bash "$file" >/dev/null 2>&1 &
-done
-echo "Submitted batch job 7"
-""",
-    "srun": """#!/usr/bin/env bash
-while [[ $1 == -* ]]; do
-    if [[ $1 == --output || $1 == --error ]]; then shift; fi
-    shift
-done
-exec "$@"
-""",
-    "sacct": """#!/usr/bin/env bash
-printf 'JobID|State|NodeList\\n7_0|RUNNING|here\\n7_1|RUNNING|here\\n'
-""",
-}
 
 
 def needs(launcher: str) -> None:
@@ -61,24 +33,10 @@ def needs(launcher: str) -> None:
 
 def sweep(launcher: str, folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
     """Run a sweep over seeds 0 and 1."""
-    binaries = folder / "bin"
-    binaries.mkdir()
-    for name, text in CLUSTER.items():
-        (binaries / name).write_text(text)
-        (binaries / name).chmod(0o755)
     command = [sys.executable, "-m", "runners.probe", "-m", f"hydra/launcher={launcher}"]
-    environment = {
-        **os.environ,
-        "PATH": f"{binaries}{os.pathsep}{os.environ['PATH']}",
-        "OMP_NUM_THREADS": "1",
-    }
-    return subprocess.run(
-        [*command, "seed=0,1", *SMALL, f"logs={folder / 'logs'}", *overrides],
-        capture_output=True,
-        text=True,
-        env=environment,
-        timeout=300,
-    )
+    command += ["seed=0,1", *SMALL, f"logs={folder / 'logs'}", *overrides]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300)
 
 
 @pytest.mark.parametrize("launcher", PLUGINS)
@@ -96,7 +54,7 @@ def test_every_job_of_a_sweep_records_its_session(launcher: str, tmp_path: Path)
         assert here.digest == recording.hypotheses(4).digest
 
 
-@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+@pytest.mark.parametrize("launcher", PLUGINS)
 def test_a_mistake_in_a_job_is_an_error_of_the_sweep(launcher: str, tmp_path: Path) -> None:
     needs(launcher)
     done = sweep(launcher, tmp_path, "method.iterations=-1")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import signal
 import subprocess
 import sys
@@ -19,12 +18,9 @@ from scipy.spatial.transform import Rotation
 
 import chsel
 from chsel.errors import MeshError
-from chsel.methods import build_method
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import object_symmetry
-from chsel.problem.poses import apply
-from replay.__main__ import main as replay
 from replay.events import Logged, Measured
 from replay.mcap.reader import read_recording
 from runners import probe
@@ -68,9 +64,7 @@ def finished(
     return run_folder(logs), done
 
 
-def test_recorded_errors_are_modulo_symmetries(
-    finished: tuple[Path, Done],
-) -> None:
+def test_recorded_errors_are_modulo_symmetries(finished: tuple[Path, Done]) -> None:
     recording = read_recording(finished[0] / "recording.mcap")
     symmetry = object_symmetry(recording.start.mesh)
     assert len(symmetry.rotations) == 4
@@ -100,15 +94,10 @@ def test_trust_is_on_the_terminal_in_the_summary_and_in_the_log(
     assert shown.rpartition(f"{trusts[2]}: ")[2] in set(MEANINGS.values())
 
 
-def after(done: Done, text: str) -> list[str]:
-    """The lines of the output behind the one that begins with this text."""
-    lines = done.stdout.splitlines()
-    return lines[next(n for n, line in enumerate(lines) if line.startswith(text)) + 1 :]
-
-
 def shown_pose(done: Done, step: int) -> FloatArray:
     """The pose at the end of a run, world_from_object (4, 4), from millimetres and x y z w."""
-    position, quaternion = after(done, f"best pose after probe {step}, world_from_object")[:2]
+    _, _, shown = done.stdout.partition(f"best pose after probe {step}, world_from_object")
+    _, position, quaternion = shown.splitlines()[:3]
     assert position.endswith(" mm")
     assert quaternion.endswith(" (x y z w)")
     pose = np.eye(4)
@@ -117,8 +106,8 @@ def shown_pose(done: Done, step: int) -> FloatArray:
     return pose
 
 
-def test_a_run_ends_with_the_best_pose_and_the_command_that_exports_all(
-    finished: tuple[Path, Done], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_run_ends_with_the_best_pose_and_its_summary_has_one_a_mode(
+    finished: tuple[Path, Done],
 ) -> None:
     folder, done = finished
     recording = read_recording(folder / "recording.mcap")
@@ -132,11 +121,6 @@ def test_a_run_ends_with_the_best_pose_and_the_command_that_exports_all(
         np.testing.assert_allclose(row["modes_world_from_object"], modes, atol=1e-12)
         assert len(modes) == max(trust.modes, 1)
     np.testing.assert_allclose(shown_pose(done, 2), rows[2]["world_from_object"], atol=2e-4)
-    command = shlex.split(after(done, "all hypotheses as arrays:")[0])
-    monkeypatch.chdir(tmp_path)
-    assert replay(command[3:]) == 0
-    exported = np.load("recording_hypotheses.npz")["step_2/object_from_world"]
-    np.testing.assert_array_equal(exported, recording.hypotheses(2).object_from_world)
 
 
 def test_points_of_ones_own_are_registered_by_anchored_unless_a_method_is_named(
@@ -148,9 +132,6 @@ def test_points_of_ones_own_are_registered_by_anchored_unless_a_method_is_named(
     assert done.stdout.splitlines()[1] == line
     summary = json.loads((run_folder(tmp_path) / "summary.json").read_text())
     assert summary["method"] == "anchored"
-    last = summary["steps"][-1]["world_from_object"]
-    np.testing.assert_allclose(shown_pose(done, 2), last, atol=2e-4)
-    assert "replay export" not in done.stdout
     assert "(the default for" not in finished[1].stdout
 
 
@@ -173,9 +154,7 @@ def test_the_default_method_follows_from_session_policy_and_preset(
         assert compose("probe", [*overrides]).method.name == method
 
 
-def test_a_run_leaves_recordings_config_and_summary(
-    finished: tuple[Path, Done],
-) -> None:
+def test_a_run_leaves_recordings_config_and_summary(finished: tuple[Path, Done]) -> None:
     folder, done = finished
     names = {file.name for file in folder.iterdir()}
     assert names == {"recording.mcap", "recording.rrd", "config.yaml", "summary.json"}
@@ -194,20 +173,6 @@ def test_a_run_leaves_recordings_config_and_summary(
     assert "errors to the true pose modulo the object's symmetries, at its centre: best" in title
     assert f"{folder}/\n" in done.stdout
     assert done.stderr == ""
-
-
-def test_every_problem_of_the_recording_gives_the_recorded_result(
-    finished: tuple[Path, Done],
-) -> None:
-    recording = read_recording(finished[0] / "recording.mcap")
-    settings = dict(recording.start.config["method"])
-    method = build_method(settings.pop("name"), settings)
-    for step in recording.steps:
-        again = method.register(recording.problem(step))
-        assert again.digest == recording.hypotheses(step).digest
-        assert again.archive is not None
-        assert again.archive.digest == recording.snapshots(step)[-1].digest
-    assert recording.steps == (0, 1, 2)
 
 
 def test_the_same_command_writes_the_same_bytes_and_no_path_or_clock(
@@ -240,22 +205,14 @@ def test_a_recorded_session_repeats_the_probes_with_another_method(
     finished: tuple[Path, Done], tmp_path: Path
 ) -> None:
     source = finished[0] / "recording.mcap"
-    done = run(
-        tmp_path,
-        "session=recorded",
-        f"session.path={source}",
-        "method=gradient_descent",
-        *QUICK[:2],
-        "recording=mcap",
-    )
+    chosen = ("session=recorded", f"session.path={source}", "method=gradient_descent", *QUICK[:2])
+    done = run(tmp_path, *chosen, "recording=mcap")
     assert done.returncode == 0, done.stderr
     again = read_recording(run_folder(tmp_path) / "recording.mcap")
     before = read_recording(source)
     assert again.problem(2).points.digest == before.problem(2).points.digest
     assert again.start.sdf.digest == before.start.sdf.digest
-    assert again.start.object == "mesh"
-    assert again.steps == before.steps
-    assert again.hypotheses(2).archive is None
+    assert (again.start.object, again.steps) == ("mesh", before.steps)
 
 
 @pytest.mark.usefixtures("interruptible")
@@ -285,50 +242,24 @@ def test_ctrl_c_ends_with_a_whole_recording_and_status_130(
     ("override", "message"),
     [
         ("+typo=3", "probe.typo does not exist; accepted: assets"),
-        ("+method.typo=3", "method.typo does not exist; accepted: anchors"),
         ("method.descent.iterations=9", "method=anchored has no key 'descent'; accepted: size, "),
-        (
-            "method=chsel method.cst.alpha=1",
-            "method=chsel has no key 'cst'; did you mean cost? accepted: ",
-        ),
+        ("method=chsel method.cst.alpha=1", "has no key 'cst'; did you mean cost? accepted: "),
         ("methd=chsel", "probe has no key 'methd'; did you mean method? accepted: "),
         ("definition=paper", "Could not override 'definition'. No match in the defaults list"),
         ("seed.x=1", "seed has no key 'x'; accepted: no key below it"),
         ("seed=${nothing}", "Interpolation key 'nothing' not found"),
         ("--config-name=nothing", "Cannot find primary config 'nothing'"),
-        ("method=chsl", "method has no option 'chsl'; did you mean chsel? accepted: anchored, "),
         ("object=ycb/dril", "object/ycb has no option 'dril'; did you mean drill? accepted: "),
-        ("preset=papr", "preset has no option 'papr'; did you mean paper?"),
-        (
-            "method=chsel method.cost.free_term=out",
-            "method.cost: free_term is 'out'; accepted: direct, interior",
-        ),
-        (
-            "method=chsel method.cost.free_scale=many",
-            "method.cost.free_scale is 'many'; accepted: a number",
-        ),
+        ("method=chsel method.cost.free_scale=many", "free_scale is 'many'; accepted: a number"),
         ("seed=-1", "seed is -1; accepted: an integer from 0"),
-        ("threads=0", "threads is 0; accepted"),
         ("threads=10000", "threads is 10000; accepted: an integer from 1 to 256"),
         ("object.path=nothing.obj", "mesh file nothing.obj does not exist"),
         ("session.path=nothing.npz", "point file nothing.npz does not exist"),
         ("logs=/dev/null", "run folder /dev/null/probe"),
-        ("session.path=null", "session.path=FILE"),
         ("seed=1=2{", "seed is '1=2{'; accepted: an integer"),
         ("seed", "'seed' is not a setting"),
-        (
-            "session=kinematic object=clamp configuration=drill",
-            "accepted for object clamp: clamp, ",
-        ),
-        ("session=kinematic configuration=dril", "configuration 'dril' does not exist; accepted: "),
-        (
-            "session=kinematic object=ycb/drill assets.dir=/nowhere",
-            "runners.fetch object=ycb/drill",
-        ),
-        (
-            "session=sensors session.rig.cameras.0.edge_reach=3",
-            "accepted: +session.rig.cameras.0.edge_reach=VALUE to add it",
-        ),
+        ("session=kinematic object=clamp configuration=drill", "'drill'; accepted: clamp, "),
+        ("session=sensors session.rig.cameras.0.edge_reach=3", "accepted: +session.rig.cameras.0."),
         (
             "session=sensors session.path=no.mcap session.rig.contact.threshold=0.003",
             "log no.mcap does not exist",
@@ -351,21 +282,3 @@ def test_a_mistake_is_one_line_and_status_2(
 def test_traceback_is_shown_when_asked_for(points: tuple[str, ...], tmp_path: Path) -> None:
     with pytest.raises(MeshError):  # which Python prints with its traceback
         run(tmp_path, *points, "object.path=nothing.obj", "--traceback")
-
-
-@pytest.mark.parametrize(("name", "limit"), [("icub_lego", 10e-3), ("ycbv_gelatin_box", 4e-3)])
-def test_real_measurements_are_registered(
-    real_directory: Path, tmp_path: Path, name: str, limit: float
-) -> None:
-    """Mean |SDF| of the best hypothesis stays in the range of multi-start ICP."""
-    overrides = ["session=points", "object=mesh", "method=chsel", "recording=mcap"]
-    overrides += [f"session.path={real_directory / name}.npz"]
-    overrides += [f"object.path={real_directory / name}.obj"]
-    done = run(tmp_path, *overrides)
-    assert done.returncode == 0, done.stderr
-    recording = read_recording(run_folder(tmp_path) / "recording.mcap")
-    (step,) = recording.steps
-    problem = recording.problem(step)
-    moved = apply(recording.hypotheses(step).object_from_world[0], problem.points.known)
-    sdf, _ = problem.sdf.at(moved, lookup="trilinear")
-    assert float(np.abs(sdf).mean()) < limit

@@ -35,8 +35,8 @@ from replay.mcap.reader import read_recording
 from replay.mcap.recovery import recover, tells_loss
 from runners.command.choices import CONF, store_choices
 from runners.command.program import plain
+from runners.probe import Interrupt, run
 from runners.run.display import Display
-from runners.run.probe_run import Interrupt, run
 from runners.run.recording import make_run_folder
 from runners.run.scene import ProbeConfig, open_scene, session_started
 from tests.replay.conftest import same_bits

@@ -1,52 +1,19 @@
-"""Scans from a real HTTP server: refused, cut, unpacked, checked."""
+"""Archives of scans: cut, unpacked, checked, placed."""
 
 from __future__ import annotations
 
 import io
 import tarfile
-import threading
-from collections.abc import Callable, Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from chsel.errors import SettingError
 from runners.objects.scans import AssetsConfig, DownloadError, download_scan
 
-SCAN = "012_strawberry"  # of the set, but of no known extents
-Serve = Callable[[bytes], AssetsConfig]
-
-
-@pytest.fixture
-def serve(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Serve]:
-    """Serves some bytes as the archive of any scan; nothing is answered by 404."""
-    content = b""
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200 if content else 404)
-            self.end_headers()
-            self.wfile.write(content)
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    def hold(held: bytes) -> AssetsConfig:
-        nonlocal content
-        content = held
-        return AssetsConfig(str(tmp_path / "assets"), f"http://127.0.0.1:{http.server_port}")
-
-    monkeypatch.setenv("no_proxy", "127.0.0.1")
-    http = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=http.serve_forever, kwargs={"poll_interval": 0.01})
-    thread.start()
-    yield hold
-    http.shutdown()
-    thread.join()
-    http.server_close()
+SCAN = "012_strawberry"
 
 
 def archive(mesh: trimesh.Trimesh, scan: str = SCAN) -> bytes:
@@ -71,59 +38,49 @@ def open_box() -> trimesh.Trimesh:
 
 
 BOX = archive(trimesh.creation.box((0.1, 0.2, 0.3)))
+Serve = Callable[[bytes], AssetsConfig]
+
+
+@pytest.fixture
+def serve(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Serve:
+    """Hands some bytes out as the archive of any scan."""
+
+    def hold(content: bytes) -> AssetsConfig:
+        def retrieve(url: str, known_hash: None, path: str, downloader: object) -> str:
+            (Path(path) / "archive").write_bytes(content)
+            return str(Path(path) / "archive")
+
+        monkeypatch.setattr("pooch.retrieve", retrieve)
+        return AssetsConfig(str(tmp_path / "assets"), "http://host")
+
+    return hold
 
 
 def test_the_mesh_is_placed_as_in_the_official_archive_and_nothing_else(serve: Serve) -> None:
     assets = serve(BOX)
-    assert download_scan(SCAN, assets) == "8 vertices, 100.0 x 200.0 x 300.0 mm, watertight"
+    assert download_scan(SCAN, assets) == "8 vertices, 100.0 x 200.0 x 300.0 mm"
     files = [path for path in assets.folder.parent.rglob("*") if path.is_file()]
     assert files == [assets.folder / SCAN / "google_16k" / "nontextured.ply"]
 
 
+@pytest.mark.filterwarnings("ignore:mesh file")  # the open one
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (archive(open_box()), "not the archive of the scan: scan 012_strawberry is not watertight"),
-        (archive(trimesh.creation.box(), scan="other"), "not the archive .* does not exist"),
-        (b"<html>", "not the archive of the scan: not a gzip file"),
-        (BOX[:-200], "not the archive of the scan: Compressed file ended"),
-        (b"", r"cannot be downloaded \(404 .*try again$"),
+        (archive(open_box()), "its mesh is not watertight"),
+        (archive(trimesh.creation.box(), scan="other"), "does not exist"),
+        (b"<html>", "not a gzip file"),
+        (BOX[:-200], "Compressed file ended"),
     ],
-    ids=["open", "another", "a page", "cut", "nothing"],
+    ids=["open", "another", "a page", "cut"],
 )
 def test_what_is_not_the_scan_leaves_nothing(serve: Serve, content: bytes, reason: str) -> None:
     assets = serve(content)
-    with pytest.raises(DownloadError, match=rf"_google_16k\.tgz .*{reason}") as caught:
+    with pytest.raises(DownloadError, match=rf"_google_16k\.tgz is not the archive .*{reason}"):
         download_scan(SCAN, assets)
-    assert "\n" not in str(caught.value)
     assert list(assets.folder.iterdir()) == []
 
 
 def test_no_server_at_all_is_reported(tmp_path: Path) -> None:
-    assets = AssetsConfig(str(tmp_path), "http://127.0.0.1:1")
     with pytest.raises(DownloadError, match=r"refused.*; try again"):
-        download_scan(SCAN, assets)
-
-
-def test_a_scan_of_other_extents_is_refused(serve: Serve) -> None:
-    drill, extents = "035_power_drill", np.array([0.1605, 0.1210, 0.1915])
-    assets = serve(archive(trimesh.creation.box(extents * [1, 1.011, 1]), drill))
-    with pytest.raises(DownloadError, match=r"160\.5 x 122\.3 x 191\.5 mm; expected: 160\.5 x 121"):
-        download_scan(drill, assets)
-    assets = serve(archive(trimesh.creation.box(extents * [1, 1.009, 1]), drill))
-    assert "watertight" in download_scan(drill, assets)
-
-
-@pytest.mark.parametrize("url", ["ftp://host/x", "x"])
-def test_other_addresses_are_refused(url: str) -> None:
-    with pytest.raises(SettingError, match=r"url is .*; accepted: an http:// or https:// address"):
-        AssetsConfig("assets", url)
-
-
-def test_a_folder_of_scans_is_given_and_its_home_is_expanded(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    with pytest.raises(SettingError, match="dir is empty"):
-        AssetsConfig("", "http://host")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert AssetsConfig("~/scans", "http://host").folder == tmp_path / "scans"
+        download_scan(SCAN, AssetsConfig(str(tmp_path), "http://127.0.0.1:1"))

