@@ -1,13 +1,10 @@
 """Which package may import which, and inside a package which folder may import which."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -82,12 +79,12 @@ EVERY_METHOD = {"method"}  # the protocol that they implement
 ALL_METHODS = {""}  # chsel/methods/__init__.py, the table of all methods
 
 
-def module_name(file: Path, root: Path) -> str:
+def module_name(file, root):
     parts = file.relative_to(root).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imported(file: Path, root: Path) -> Iterator[str]:
+def imported(file, root):
     """All that a file imports, in functions and for type checking, too: modules, or their names."""
     package = [*file.relative_to(root).parts[:-1]]
     for node in ast.walk(ast.parse(file.read_text())):
@@ -99,10 +96,10 @@ def imported(file: Path, root: Path) -> Iterator[str]:
             yield from (f"{source}.{alias.name}" for alias in node.names)
 
 
-def import_graph(root: Path, package: str = "chsel") -> dict[str, set[str]]:
+def import_graph(root, package="chsel"):
     """The modules of a package in `root`, and those of them that each imports."""
     modules = {module_name(file, root): file for file in sorted((root / package).rglob("*.py"))}
-    graph: dict[str, set[str]] = {}
+    graph = {}
     for module, file in modules.items():
         names = (name for name in imported(file, root) if name.split(".")[0] == package)
         ends = (name if name in modules else name.rpartition(".")[0] for name in names)
@@ -110,13 +107,13 @@ def import_graph(root: Path, package: str = "chsel") -> dict[str, set[str]]:
     return graph
 
 
-def unplaced(root: Path, package: str = "chsel") -> set[str]:
+def unplaced(root, package="chsel"):
     """Folders of a package that MAY_IMPORT leaves out."""
     folders = {path.parent.relative_to(root / package) for path in root.glob(f"{package}/**/*.py")}
     return {folder.parts[0] for folder in folders if folder.parts} - set(MAY_IMPORT[package])
 
 
-def forbidden_imports(graph: dict[str, set[str]]) -> list[str]:
+def forbidden_imports(graph):
     """Imports from a folder that the importing one may not know."""
     return [
         f"{module} imports {end}"
@@ -126,7 +123,7 @@ def forbidden_imports(graph: dict[str, set[str]]) -> list[str]:
     ]
 
 
-def _may_import(module: list[str], end: list[str]) -> bool:
+def _may_import(module, end):
     """Whether a module may import another one of its package; both are paths of names."""
     package, *place = module
     folders, lowest = MAY_IMPORT[package], LOWEST[package]
@@ -143,12 +140,12 @@ def _may_import(module: list[str], end: list[str]) -> bool:
     return not inside_methods or _method_may_import("".join(place[1:2]), "".join(end[2:3]))
 
 
-def _method_may_import(name: str, other: str) -> bool:
+def _method_may_import(name, other):
     known = name in ALL_METHODS or other in EVERY_METHOD
     return known or other == name or other in BUILT_OF.get(name, ())
 
 
-def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+def circles(graph):
     """Modules that import each other, directly or by way of others."""
     names = list(graph)
     arrows = [(names.index(name), names.index(end)) for name in names for end in graph[name]]
@@ -162,7 +159,7 @@ def circles(graph: dict[str, set[str]]) -> list[list[str]]:
     ]
 
 
-def repeated(root: Path, package: str = "chsel") -> set[str]:
+def repeated(root, package="chsel"):
     """File names and class names that stand in a package twice."""
     files = [file for file in (root / package).rglob("*.py") if file.name != "__init__.py"]
     nodes = (node for file in files for node in ast.walk(ast.parse(file.read_text())))
@@ -172,14 +169,14 @@ def repeated(root: Path, package: str = "chsel") -> set[str]:
 
 
 @pytest.mark.parametrize("package", FORBIDDEN)
-def test_a_package_imports_only_what_it_may(package: str) -> None:
+def test_a_package_imports_only_what_it_may(package):
     files = sorted((REPOSITORY / package).rglob("*.py"))
     assert len(files) > 5
     tops = {file: {name.split(".")[0] for name in imported(file, REPOSITORY)} for file in files}
     assert not {file: names for file, names in tops.items() if names & FORBIDDEN[package]}
 
 
-def test_the_page_for_maintainers_has_these_rules() -> None:
+def test_the_page_for_maintainers_has_these_rules():
     for header, rules in {
         "package | never imports": FORBIDDEN,
         **{f"folder of `{package}` | may import": MAY_IMPORT[package] for package in MAY_IMPORT},
@@ -192,26 +189,26 @@ def test_the_page_for_maintainers_has_these_rules() -> None:
 
 
 @pytest.mark.parametrize("package", MAY_IMPORT)
-def test_every_folder_has_its_layer(package: str) -> None:
+def test_every_folder_has_its_layer(package):
     assert unplaced(REPOSITORY, package) == set()
     there = {path.stem for path in (REPOSITORY / package).iterdir()}
     assert there >= set(MAY_IMPORT[package]) | LOWEST[package]
 
 
 @pytest.mark.parametrize("package", MAY_IMPORT)
-def test_no_folder_imports_one_above_it(package: str) -> None:
+def test_no_folder_imports_one_above_it(package):
     graph = import_graph(REPOSITORY, package)
     assert len(graph) > 30
     assert forbidden_imports(graph) == []
 
 
 @pytest.mark.parametrize("package", FORBIDDEN)
-def test_no_circle_of_imports(package: str) -> None:
+def test_no_circle_of_imports(package):
     assert circles(import_graph(REPOSITORY, package)) == []
 
 
 @pytest.mark.parametrize("package", MAY_IMPORT)
-def test_no_name_of_a_file_or_class_means_two_things(package: str) -> None:
+def test_no_name_of_a_file_or_class_means_two_things(package):
     assert repeated(REPOSITORY, package) == set()
 
 
@@ -229,14 +226,14 @@ PLANTED = {
 
 
 @pytest.mark.parametrize("name", PLANTED)
-def test_an_arrow_back_up_is_seen(name: str, tmp_path: Path) -> None:
+def test_an_arrow_back_up_is_seen(name, tmp_path):
     plant(tmp_path, {**dict.fromkeys([*PLANTED, "api.py"], ""), name: PLANTED[name]})
     found = forbidden_imports(import_graph(tmp_path))
     assert [line.split()[0] for line in found] == [module_name(Path("chsel") / name, Path())]
     assert unplaced(tmp_path) == repeated(tmp_path) == set()
 
 
-def test_imports_of_lower_folders_are_no_arrow_back_up(tmp_path: Path) -> None:
+def test_imports_of_lower_folders_are_no_arrow_back_up(tmp_path):
     files = {
         "errors.py": "",
         "numerics/a.py": "from chsel.errors import ChselError",
@@ -253,7 +250,7 @@ def test_imports_of_lower_folders_are_no_arrow_back_up(tmp_path: Path) -> None:
     assert forbidden_imports(graph) == circles(graph) == []
 
 
-def test_a_circle_inside_a_folder_is_seen(tmp_path: Path) -> None:
+def test_a_circle_inside_a_folder_is_seen(tmp_path):
     files = {
         "cost/a.py": "from chsel.cost.b import B",
         "cost/b.py": "def f():\n    from chsel.cost.c import C",
@@ -264,7 +261,7 @@ def test_a_circle_inside_a_folder_is_seen(tmp_path: Path) -> None:
     assert circles(import_graph(tmp_path)) == [["chsel.cost.a", "chsel.cost.b", "chsel.cost.c"]]
 
 
-def test_a_new_folder_and_a_second_meaning_are_seen(tmp_path: Path) -> None:
+def test_a_new_folder_and_a_second_meaning_are_seen(tmp_path):
     files = {
         "cost/kernels.py": "class Cost:\n    pass",
         "qd/kernels.py": "def f():\n    class Cost:\n        pass",
@@ -275,7 +272,7 @@ def test_a_new_folder_and_a_second_meaning_are_seen(tmp_path: Path) -> None:
     assert repeated(tmp_path) == {"kernels.py", "Cost"}
 
 
-def plant(root: Path, files: dict[str, str]) -> None:
+def plant(root, files):
     """Write files of a package chsel, with an __init__.py where there is none."""
     for name, text in files.items():
         file = root / "chsel" / name
@@ -285,7 +282,7 @@ def plant(root: Path, files: dict[str, str]) -> None:
         (folder / "__init__.py").touch()
 
 
-def test_the_physics_engine_is_imported_in_one_place() -> None:
+def test_the_physics_engine_is_imported_in_one_place():
     files = (REPOSITORY / "runners").rglob("*.py")
     engine = ("pybullet", "pybullet_data")
     users = {
@@ -296,7 +293,7 @@ def test_the_physics_engine_is_imported_in_one_place() -> None:
     assert users == {"physics_engine.py"}
 
 
-def test_nothing_imports_the_physics_engine_before_it_is_needed() -> None:
+def test_nothing_imports_the_physics_engine_before_it_is_needed():
     code = "import sys, runners.probe, runners.sessions; print('pybullet' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

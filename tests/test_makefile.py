@@ -1,7 +1,5 @@
 """What make would do, without doing it, and which versions it asks pip for."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
@@ -15,7 +13,7 @@ MAKE = shutil.which("make")
 pytestmark = pytest.mark.skipif(MAKE is None, reason="make is not installed")
 
 
-def made(folder: Path, *words: str) -> str:
+def made(folder, *words):
     for name in ("Makefile", "constraints.txt", "pyproject.toml"):
         shutil.copy(REPOSITORY / name, folder)
     command = ["make", f"PYTHON={sys.executable}", *words]
@@ -30,7 +28,7 @@ STEPS = [f'{INSTALL} --editable ".[{extra}]"' for extra in ("all", "test")]
 
 
 @pytest.mark.parametrize("goal", ["probe", "test"])
-def test_make_passes_options_on_to_pip_and_venv(goal: str, tmp_path: Path) -> None:
+def test_make_passes_options_on_to_pip_and_venv(goal, tmp_path):
     words = (f"PIP_ARGS={OPTIONS}", "VENV_ARGS=--system-site-packages")
     lines = made(tmp_path, "-n", goal, *words).splitlines()
     steps = [line for line in lines if "pip install" in line]
@@ -39,7 +37,7 @@ def test_make_passes_options_on_to_pip_and_venv(goal: str, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("version", [None, "2.9.1+cpu"])
-def test_a_torch_that_is_there_stays(version: str | None, tmp_path: Path) -> None:
+def test_a_torch_that_is_there_stays(version, tmp_path):
     venv.create(tmp_path / ".venv", with_pip=False)
     if version is not None:
         (packages,) = (tmp_path / ".venv").glob("lib/python*/site-packages")

@@ -1,14 +1,11 @@
 """The project works when it is installed, from any folder: packages, scripts, completion."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,13 +14,13 @@ import yaml
 
 pytestmark = pytest.mark.slow
 REPOSITORY = Path(__file__).resolve().parents[1]
-PROJECT: dict[str, Any] = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
 SCRIPTS = tuple(PROJECT["scripts"])
 BASH = shutil.which("bash")
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(tmp_path_factory):
     """The folder of packages of an installation of the checkout; its scripts are in `bin`."""
     folder = tmp_path_factory.mktemp("installation")
     listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
@@ -38,16 +35,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site"
 
 
-def ran(
-    site: Path, folder: Path, *command: str, **changes: str
-) -> subprocess.CompletedProcess[str]:
+def ran(site, folder, *command, **changes):
     """A command of the installation, in a folder."""
     path = os.pathsep.join([str(site / "bin"), str(Path(sys.executable).parent), os.defpath])
     environment = {**os.environ, "PYTHONPATH": str(site), "PATH": path, **changes}
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
 
 
-def test_four_packages_with_their_data_and_no_tests_are_installed(site: Path) -> None:
+def test_four_packages_with_their_data_and_no_tests_are_installed(site):
     beside = ("bin", "dist-info", "__pycache__")
     packages = {path.name for path in site.iterdir() if not path.name.endswith(beside)}
     assert packages == {"chsel", "conf", "replay", "runners"}
@@ -58,7 +53,7 @@ def test_four_packages_with_their_data_and_no_tests_are_installed(site: Path) ->
         assert names == {str(file.relative_to(site)) for file in site.glob(pattern)}
 
 
-def test_the_installed_command_runs_in_any_folder(site: Path, tmp_path: Path) -> None:
+def test_the_installed_command_runs_in_any_folder(site, tmp_path):
     box = trimesh.creation.box((0.1, 0.06, 0.2))
     box.export(tmp_path / "box.stl")
     np.savez(tmp_path / "points.npz", surface=box.vertices[:6])
@@ -74,9 +69,7 @@ def test_the_installed_command_runs_in_any_folder(site: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_every_command_has_a_script_and_each_names_its_version(
-    script: str, site: Path, tmp_path: Path
-) -> None:
+def test_every_command_has_a_script_and_each_names_its_version(script, site, tmp_path):
     module = script.removeprefix("chsel-").replace("-", "_")
     module = "replay" if module == "replay" else f"runners.{module}"
     for command in ([script], [sys.executable, "-m", module]):
@@ -85,16 +78,14 @@ def test_every_command_has_a_script_and_each_names_its_version(
 
 
 @pytest.mark.parametrize("script", ["chsel-report", "chsel-replay"])
-def test_a_mistake_in_the_arguments_of_a_script_is_one_line(
-    script: str, site: Path, tmp_path: Path
-) -> None:
+def test_a_mistake_in_the_arguments_of_a_script_is_one_line(script, site, tmp_path):
     mistaken = ran(site, tmp_path, script, "colour=red")
     assert mistaken.returncode == 2
     assert mistaken.stderr.startswith("error: ")
     assert mistaken.stderr.count("\n") == 1
 
 
-def test_every_command_of_hydra_has_a_script() -> None:
+def test_every_command_of_hydra_has_a_script():
     commands = {file.stem for file in (REPOSITORY / "conf").glob("*.yaml")}
     assert set(SCRIPTS) == {f"chsel-{name.replace('_', '-')}" for name in commands | {"replay"}}
 
@@ -118,7 +109,7 @@ completed chsel-replay verify --j
 
 
 @pytest.mark.skipif(BASH is None, reason="bash is not installed")
-def test_bash_completes_the_scripts(site: Path, tmp_path: Path) -> None:
+def test_bash_completes_the_scripts(site, tmp_path):
     done = ran(site, tmp_path, "bash", "-c", COMPLETED)
     assert done.stderr == ""
     assert done.stdout.splitlines() == [
@@ -130,7 +121,7 @@ def test_bash_completes_the_scripts(site: Path, tmp_path: Path) -> None:
     ]
 
 
-def test_the_citation_is_of_this_version_and_the_paper() -> None:
+def test_the_citation_is_of_this_version_and_the_paper():
     citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
     assert {"cff-version", "message", "title", "authors"} <= set(citation)
     for key in ("version", "license"):

@@ -1,11 +1,8 @@
-from __future__ import annotations
-
 import dataclasses
 import re
 import warnings
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,11 +22,11 @@ DOWN = np.diag([1.0, -1.0, -1.0])
 POINT = [[0.1, 0.2, 0.3]]
 
 
-def register(**arguments: Any) -> chsel.Hypotheses:
+def register(**arguments):
     return chsel.register(BOX, **{"method": "chsel", "settings": QUICK, **arguments})
 
 
-def test_a_mesh_and_points_are_all_it_takes() -> None:
+def test_a_mesh_and_points_are_all_it_takes():
     found = chsel.register(BOX, surface=torch.tensor(SURFACE))
     assert found.object_from_world.shape == (30, 4, 4)
     world = inverse(found.object_from_world)
@@ -37,7 +34,7 @@ def test_a_mesh_and_points_are_all_it_takes() -> None:
     assert np.abs(world[0, :3, 3] - POSE[:3, 3]).max() < 0.005
 
 
-def test_a_grid_a_mesh_lists_and_tensors_give_the_same_bits() -> None:
+def test_a_grid_a_mesh_lists_and_tensors_give_the_same_bits():
     grid = chsel.SdfGrid.from_mesh(BOX, 0.002)
     digests = {
         register(surface=SURFACE).digest,
@@ -50,7 +47,7 @@ def test_a_grid_a_mesh_lists_and_tensors_give_the_same_bits() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:the SDF grid of an object:chsel.MeshWarning")
-def test_a_thin_plate_is_found_and_its_grid_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thin_plate_is_found_and_its_grid_is_made_once(monkeypatch):
     monkeypatch.setattr("chsel.problem.sdf_grid.DEFAULT_NODES", 40_000)
     plate = trimesh.creation.box((0.1, 0.06, 0.002))
     touched = trimesh.sample.sample_surface(plate, 40, seed=0)[0]
@@ -65,7 +62,7 @@ def test_a_thin_plate_is_found_and_its_grid_is_made_once(monkeypatch: pytest.Mon
     assert again.digest == found.digest
 
 
-def test_points_added_later_start_from_the_previous_result() -> None:
+def test_points_added_later_start_from_the_previous_result():
     first = register(surface=SURFACE[:20])
     second = register(surface=SURFACE, previous=first, step=1)
     cost = chsel.RelaxedCost(chsel.SdfGrid.from_mesh(BOX, 0.002), chsel.KnownPoints(known=SURFACE))
@@ -87,14 +84,14 @@ def test_points_added_later_start_from_the_previous_result() -> None:
 )
 @pytest.mark.parametrize("preset", ["default", "paper", "reference"])
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_odd_points_have_a_defined_result(points: dict[str, Any], preset: str) -> None:
+def test_odd_points_have_a_defined_result(points, preset):
     found = register(**points, preset=preset, hypotheses=5)
     assert found.object_from_world.shape == (5, 4, 4)
     assert np.isfinite(found.object_from_world).all()
     assert np.isfinite(found.cost).all()
 
 
-def warned(**arguments: Any) -> list[chsel.InputWarning]:
+def warned(**arguments):
     """The warnings of a registration, each of this file's line that asked for it."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -113,7 +110,7 @@ FREE = FREE[
 @pytest.mark.parametrize(
     ("method", "settings"), [("chsel", QUICK), ("anchored", {"size": "small"})]
 )
-def test_good_points_give_no_warning(method: str, settings: dict[str, Any]) -> None:
+def test_good_points_give_no_warning(method, settings):
     room = chsel.Workspace.around(SURFACE, 0.1)
     assert (
         warned(surface=SURFACE, free=FREE, workspace=room, method=method, settings=settings) == []
@@ -134,11 +131,11 @@ def test_good_points_give_no_warning(method: str, settings: dict[str, Any]) -> N
         ({"surface": 3.0 * SURFACE}, "no_fit"),
     ],
 )
-def test_points_that_are_hardly_meant_give_a_warning(arguments: Any, code: str) -> None:
+def test_points_that_are_hardly_meant_give_a_warning(arguments, code):
     assert code in [warning.code for warning in warned(**arguments)]
 
 
-def test_points_13_noise_levels_from_all_poses_give_a_warning() -> None:
+def test_points_13_noise_levels_from_all_poses_give_a_warning():
     noise = np.random.default_rng(0).normal(0.0, 0.004, SURFACE.shape)
     settings = {"size": "small", "noise": 0.0001}
     found = warned(surface=SURFACE + noise, method="anchored", settings=settings)
@@ -146,9 +143,7 @@ def test_points_13_noise_levels_from_all_poses_give_a_warning() -> None:
 
 
 @pytest.mark.parametrize("method", ["chsel", "icp"])
-def test_points_far_off_all_poses_give_one_warning_with_any_method(
-    method: str,
-) -> None:
+def test_points_far_off_all_poses_give_one_warning_with_any_method(method):
     """Two calls with other points, whose misfits differ, at one line, as Python shows them."""
     mesh = BOX.copy().apply_scale(3.0)
     misfits = []
@@ -166,7 +161,7 @@ def test_points_far_off_all_poses_give_one_warning_with_any_method(
 
 
 @pytest.mark.parametrize("points", [1000.0 * SURFACE, [[0.0, 0.0, 0.0], [50.0, 0.0, 0.0]]])
-def test_points_in_millimetres_are_an_error(points: Any) -> None:
+def test_points_in_millimetres_are_an_error(points):
     with pytest.raises(chsel.ChselError, match=r"the object is 0\.1.* m: are they in mill"):
         register(surface=points)
 
@@ -181,10 +176,7 @@ def test_points_in_millimetres_are_an_error(points: Any) -> None:
         ({"surface": POINT, "method": "magic"}, "method is 'magic'; accepted: chsel"),
         ({"surface": POINT, "preset": "best"}, "preset is 'best'; accepted: default"),
         ({"surface": POINT, "hypotheses": 0}, "hypotheses is 0"),
-        (
-            {"surface": POINT, "settings": {"alpha": 1}},
-            "settings.alpha does not exist",
-        ),
+        ({"surface": POINT, "settings": {"alpha": 1}}, "settings.alpha does not exist"),
         ({"surface": POINT, "resolution": -0.1}, "SDF resolution is -0.1"),
         (
             {"surface": POINT, "initial_set": np.zeros((2, 4, 4))},
@@ -206,34 +198,34 @@ def test_points_in_millimetres_are_an_error(points: Any) -> None:
         ({"surface": POINT, "free_resolution": -0.01}, "free_resolution is -0.01; accepted: a f"),
     ],
 )
-def test_mistakes_say_what_is_accepted(arguments: dict[str, Any], message: str) -> None:
+def test_mistakes_say_what_is_accepted(arguments, message):
     with pytest.raises(chsel.ChselError, match=message) as caught:
         register(**arguments)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400
 
 
-def test_a_target_that_is_no_mesh_is_refused() -> None:
+def test_a_target_that_is_no_mesh_is_refused():
     message = (
         r"target is 'box\.obj'; accepted: a mesh such as chsel\.load_mesh\('box\.obj'\), a Trim"
     )
     with pytest.raises(chsel.ChselError, match=message):
-        chsel.register("box.obj", surface=POINT)  # type: ignore[arg-type]
+        chsel.register("box.obj", surface=POINT)
     with pytest.raises(
         chsel.ChselError, match=r"target is .*; accepted: .*load_mesh\('box\.obj'\)"
     ):
-        chsel.register(Path("box.obj"), surface=POINT)  # type: ignore[arg-type]
+        chsel.register(Path("box.obj"), surface=POINT)
     with pytest.raises(chsel.ChselError, match=r"target is a Scene; accepted: .*chsel\.load_mesh"):
-        chsel.register(trimesh.Scene(BOX), surface=POINT)  # type: ignore[arg-type]
+        chsel.register(trimesh.Scene(BOX), surface=POINT)
 
 
-def test_integers_of_numpy_are_seeds_and_steps_too() -> None:
-    key = StreamKey(np.int64(3), np.uint8(2))  # type: ignore[arg-type]
+def test_integers_of_numpy_are_seeds_and_steps_too():
+    key = StreamKey(np.int64(3), np.uint8(2))
     assert key == StreamKey(3, 2)
     assert type(key.seed) is type(key.step) is int
 
 
-def test_the_default_is_anchored_and_in_the_presets_of_the_paper_chsel() -> None:
+def test_the_default_is_anchored_and_in_the_presets_of_the_paper_chsel():
     points = {"surface": SURFACE[:5], "settings": None}
     default = chsel.register(BOX, **points)
     assert default.digest == chsel.register(BOX, **points, method="anchored").digest
@@ -243,7 +235,7 @@ def test_the_default_is_anchored_and_in_the_presets_of_the_paper_chsel() -> None
         chsel.register(BOX, surface=POINT, settings=QUICK)
 
 
-def test_all_names_of_the_package_are_there() -> None:
+def test_all_names_of_the_package_are_there():
     assert chsel.__version__ == metadata.version("chsel-replay")
     assert all(getattr(chsel, name) is not None for name in chsel.__all__)
 
@@ -284,29 +276,29 @@ KNOWN = chsel.KnownPoints(known=SURFACE)
         (chsel.Steering, (POLICY, GRID, ROOM, 0.01, ACTIONS, BOX), "hand is .*; accepted: chs"),
     ],
 )
-def test_values_of_another_class_are_refused(make: Any, arguments: Any, message: str) -> None:
+def test_values_of_another_class_are_refused(make, arguments, message):
     with pytest.raises(chsel.ChselError, match=message) as caught:
         make(*arguments)
     assert "\n" not in str(caught.value)
 
 
-def test_arrays_in_place_of_known_points_are_refused() -> None:
+def test_arrays_in_place_of_known_points_are_refused():
     online = chsel.OnlineRegistration(GRID, ROOM, 0.01, ONLINE)
     with pytest.raises(chsel.ChselError, match=r"points is .*; accepted: chsel\.KnownPoints"):
-        next(online.steps(enumerate([SURFACE])))  # type: ignore[list-item]
+        next(online.steps(enumerate([SURFACE])))
     steering = chsel.Steering(POLICY, GRID, ROOM, 0.01, ACTIONS, HAND)
     with pytest.raises(chsel.ChselError, match=r"points is .*; accepted: chsel\.KnownPoints"):
-        steering.decide(0, SURFACE, None, np.ones(1, dtype=bool))  # type: ignore[arg-type]
+        steering.decide(0, SURFACE, None, np.ones(1, dtype=bool))
 
 
-def test_single_settings_and_whole_settings_are_both_taken() -> None:
+def test_single_settings_and_whole_settings_are_both_taken():
     whole = preset_settings("gradient_descent", "paper")
     a = chsel.register(BOX, surface=SURFACE[:5], method="gradient_descent", settings=whole)
     b = chsel.register(BOX, surface=SURFACE[:5], method="gradient_descent", preset="paper")
     assert a.digest == b.digest
 
 
-def test_a_result_says_how_far_to_trust_it_and_its_digest_does_not() -> None:
+def test_a_result_says_how_far_to_trust_it_and_its_digest_does_not():
     found = register(surface=SURFACE[:3])
     assert found.trust is not None
     assert found.trust.verdict in ("several modes", "wide")
@@ -317,14 +309,14 @@ def test_a_result_says_how_far_to_trust_it_and_its_digest_does_not() -> None:
     )
 
 
-def test_own_starts_are_used() -> None:
+def test_own_starts_are_used():
     starts = np.tile(inverse(POSE), (4, 1, 1))
     found = register(surface=SURFACE, initial_set=starts, method="gradient_descent", settings=None)
     assert len(found.cost) == 4
     assert found.duplicate.tolist() == [False, True, True, True]
 
 
-def test_the_example_in_the_readme_runs(tmp_path: Path) -> None:
+def test_the_example_in_the_readme_runs(tmp_path):
     readme = (Path(__file__).parents[2] / "README.md").read_text()
     examples = re.findall(r"```python\n(hand = chsel.*?)```", readme, re.DOTALL)
     examples += re.findall(r"```python\n(import chsel.*?)```", readme, re.DOTALL)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from chsel.methods import OURS, build_method, preset_settings
-from chsel.methods.method import Method
 from chsel.problem.settings import PRESETS, settings_mapping
 
 ALL_CLASSES = ("contacts", "free", "felt", "occupied")
@@ -31,10 +30,10 @@ class Case:
     steps: int = 1
     long: bool = False
 
-    def build(self) -> Method:
+    def build(self):
         """The method with its settings."""
         settings = settings_mapping(preset_settings(self.method, self.preset))
-        quick: dict[str, Any] = {"descent": {"restarts": 2, "iterations": 15}}
+        quick = {"descent": {"restarts": 2, "iterations": 15}}
         quick |= {"emitter": {"iterations": 12}, "online": {"hypotheses": 12}}
         quick |= {"cma_es": {"generations": 25}, "iterations": 20, "max_iterations": 6}
         quick["effort"] = {"samples": 3000, "kept": 24, "refined": 12, "steps": 8, "descents": 8}
@@ -51,17 +50,17 @@ class Case:
         return build_method(self.method, settings)
 
 
-def _changed(value: Any, change: Any) -> Any:
+def _changed(value, change):
     both = isinstance(value, dict) and isinstance(change, dict)
     return {**value, **change} if both else change
 
 
-def _measured(measure: str, bins: int, **more: Any) -> Case:
+def _measured(measure, bins, **more):
     archive = {"measure": measure, "bins": bins}
     return Case(changes={"archive": archive, **more})
 
 
-def _on_plane(measure: str, plane: dict[str, Any], method: str = "chsel", **more: Any) -> Case:
+def _on_plane(measure, plane, method="chsel", **more):
     changes = {"archive": {"measure": measure}, "plane": plane}
     return Case(method, changes=changes, place="standing", **more)
 
@@ -167,7 +166,7 @@ _LONG = {
     "long CMA-ME": Case("chsel_cma_me", "reference", body="mallet", place="mallet", long=True),
     "long descent": Case("gradient_descent", "paper", body="mallet", place="mallet", long=True),
 }
-CASES: dict[str, Case] = {
+CASES = {
     **_PRODUCT,
     **_COSTS,
     **_BASELINES,

@@ -1,7 +1,5 @@
 """The first stage in which a record is not what it should be, and by how much."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -13,7 +11,6 @@ import torch
 
 from chsel.numerics.arrays import digest
 from replay.comparing.differences import ulps
-from tests.determinism.stages import Stages
 
 GOLDEN_FILE = Path(__file__).with_name("golden.json")
 _SAMPLES = 3
@@ -22,7 +19,7 @@ Golden = dict[str, dict[str, list[str]]]
 """By case and stage: a digest of all arrays, then a few of their numbers in hexadecimal."""
 
 
-def condensed(record: dict[str, Stages]) -> Golden:
+def condensed(record):
     """Digests and samples of a record."""
     return {
         case: {stage: [stage_digest(arrays), *_samples(arrays)] for stage, arrays in stages.items()}
@@ -30,28 +27,27 @@ def condensed(record: dict[str, Stages]) -> Golden:
     }
 
 
-def stage_digest(arrays: dict[str, np.ndarray]) -> str:
+def stage_digest(arrays):
     """Digest of the arrays of a stage, short enough to be read."""
     return digest(*arrays.values())[:16]
 
 
-def _numbers(arrays: dict[str, np.ndarray]) -> np.ndarray:
+def _numbers(arrays):
     parts = [array.reshape(-1) for array in arrays.values() if array.dtype == np.float64]
     return np.concatenate(parts)
 
 
-def _samples(arrays: dict[str, np.ndarray]) -> list[str]:
+def _samples(arrays):
     numbers = _numbers(arrays)
     return [float(numbers[(i * len(numbers)) // _SAMPLES]).hex() for i in range(_SAMPLES)]
 
 
-def read_golden() -> Golden:
+def read_golden():
     """The digests that every machine must give."""
-    golden: Golden = json.loads(GOLDEN_FILE.read_text())["cases"]
-    return golden
+    return json.loads(GOLDEN_FILE.read_text())["cases"]
 
 
-def write_golden(golden: Golden) -> None:
+def write_golden(golden):
     """One line a stage, so that a change of one shows as one."""
     lines = ["{", f' "versions": {json.dumps(versions())},', ' "cases": {']
     for case, stages in golden.items():
@@ -61,12 +57,12 @@ def write_golden(golden: Golden) -> None:
     GOLDEN_FILE.write_text("\n".join([*lines, " }", "}"]) + "\n")
 
 
-def versions() -> dict[str, str]:
+def versions():
     """Of the packages that could change a bit."""
     return {module.__name__: module.__version__ for module in (numpy, torch, numba, llvmlite)}
 
 
-def other_versions() -> str:
+def other_versions():
     """Which packages are not those with which golden.json was made; empty if all are."""
     made, here = json.loads(GOLDEN_FILE.read_text())["versions"], versions()
     return ", ".join(
@@ -74,9 +70,7 @@ def other_versions() -> str:
     )
 
 
-def differences(
-    golden: Golden, record: dict[str, Stages], nearby: dict[str, Stages] | None = None
-) -> list[str]:
+def differences(golden, record, nearby=None):
     """A line for each case that is not as it should be, naming the first stage that differs.
 
     nearby: the same cases in the default setting of this machine, for how far the numbers are
@@ -90,9 +84,7 @@ def differences(
     return lines
 
 
-def _first_difference(
-    case: str, expected: dict[str, list[str]], stages: Stages, nearby: dict[str, Stages] | None
-) -> list[str]:
+def _first_difference(case, expected, stages, nearby):
     lines = []
     for stage, arrays in stages.items():
         if stage not in expected:
@@ -108,7 +100,7 @@ def _first_difference(
     return lines + [f"{case}: stage {stage!r} is missing" for stage in missing]
 
 
-def _by_samples(expected: list[str], arrays: dict[str, np.ndarray]) -> str:
+def _by_samples(expected, arrays):
     ours = np.array([float.fromhex(number) for number in _samples(arrays)])
     theirs = np.array([float.fromhex(number) for number in expected])
     apart = int(ulps(theirs, ours).max())
@@ -116,7 +108,7 @@ def _by_samples(expected: list[str], arrays: dict[str, np.ndarray]) -> str:
     return f"{f'by up to {apart} ulp ' if apart else ''}{place} the numbers in golden.json"
 
 
-def _by_arrays(usual: dict[str, np.ndarray], arrays: dict[str, np.ndarray]) -> str:
+def _by_arrays(usual, arrays):
     said = []
     for name, array in arrays.items():
         if array.shape != usual[name].shape:

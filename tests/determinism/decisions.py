@@ -1,20 +1,16 @@
 """What is decided: every policy in scenes of stored numbers, and the parts of their forecasts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 
 from chsel.next_probe.decision_problem import Actions, Belief, DecisionProblem, HandShape
 from chsel.next_probe.forecast import BeliefSettings, Forecast, belief_before, surprise
-from chsel.numerics.arrays import FloatArray
 from chsel.policies import OURS, build_policy
 from chsel.problem.poses import axis_angle, compose, inverse, product, random_rotations
-from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import Purpose, StreamKey, normals, uniforms
 from tests.determinism.problems import scene
-from tests.determinism.stages import Stages, keep
+from tests.determinism.stages import keep
 
 SCENES = ("bracket", "mallet")
 KEY = StreamKey(11, 3)
@@ -24,10 +20,10 @@ _FACES = ((0, 1, 2), (0, 2, 3), (0, 4, 1), (1, 4, 2), (2, 4, 3), (3, 4, 0))  # o
 _HAND = ((-0.03, -0.01, 0.0), (0.03, -0.01, 0.0), (0.03, 0.01, 0.0), (-0.03, 0.01, 0.0))
 
 
-def decision_stages(place: str, sdf: SdfGrid) -> dict[str, Stages]:
+def decision_stages(place, sdf):
     """By case: the forecast of a scene, then the decision of every policy about it."""
     problem = posed(place, sdf)
-    stages: Stages = {}
+    stages = {}
     parts = problem.belief.object_from_world, problem.belief.weights
     keep(stages, "belief before", {"poses": parts[0].copy(), "weights": parts[1].copy()})
     problem = replace(problem, belief=_scattered(place, sdf))
@@ -54,7 +50,7 @@ def decision_stages(place: str, sdf: SdfGrid) -> dict[str, Stages]:
     return cases
 
 
-def posed(place: str, sdf: SdfGrid) -> DecisionProblem:
+def posed(place, sdf):
     """A scene before any registration: actions along an axis and obliquely, a pyramid as hand."""
     where = scene(sdf, place, ("contacts", "free"))
     belief = belief_before(sdf, where.points, where.workspace, KEY, BeliefSettings(poses=_POSES))
@@ -82,11 +78,11 @@ def posed(place: str, sdf: SdfGrid) -> DecisionProblem:
     )
 
 
-def _scattered(place: str, sdf: SdfGrid) -> Belief:
+def _scattered(place, sdf):
     """Poses around one in the middle of the workspace, of unequal weights."""
     where = scene(sdf, place, ("contacts", "free"))
     stream = KEY.stream(Purpose.WALKS)
-    middle: FloatArray = 0.5 * (where.workspace.bounds[0] + where.workspace.bounds[1])
+    middle = 0.5 * (where.workspace.bounds[0] + where.workspace.bounds[1])
     few = axis_angle(np.array([0.0, 0.6, 0.8]), uniforms(stream, -0.4, 0.4, _POSES))
     turns = product(few, random_rotations(stream, 1))
     poses = inverse(compose(turns, middle + 0.02 * normals(stream, (_POSES, 3))))

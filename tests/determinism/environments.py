@@ -14,7 +14,6 @@ import llvmlite.binding as llvm
 import numpy as np
 
 from tests.determinism.record import read_record
-from tests.determinism.stages import Stages
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 HASWELL = "+sse4.2,+popcnt,+avx,+avx2,+fma,+f16c,+bmi,+bmi2,+lzcnt,+movbe"
@@ -28,7 +27,7 @@ class Environment:
     variables: Mapping[str, str] = field(default_factory=dict)
     arguments: tuple[str, ...] = ()
 
-    def record(self, directory: Path) -> tuple[dict[str, Stages], dict[str, str]]:
+    def record(self, directory):
         """Run all cases in a fresh process; see read_record for what comes back."""
         directory.mkdir(parents=True, exist_ok=True)
         path = directory / "record.npz"
@@ -47,30 +46,30 @@ class Environment:
         return read_record(path)
 
 
-def _x86() -> bool:
+def _x86():
     return platform.machine().lower() in ("x86_64", "amd64")
 
 
-def _host_has(*features: str) -> bool:
+def _host_has(*features):
     has = llvm.get_host_cpu_features()
     return all(has.get(feature, False) for feature in features)
 
 
-def _dispatched_by_numpy() -> str:
+def _dispatched_by_numpy():
     """The CPU features that numpy has code for beyond its baseline, and this host has."""
     try:
         from numpy._core import _multiarray_umath as umath
     except ImportError:
-        from numpy.core import _multiarray_umath as umath  # type: ignore[no-redef]  # numpy 1
+        from numpy.core import _multiarray_umath as umath  # numpy 1
     return " ".join(name for name in umath.__cpu_dispatch__ if umath.__cpu_features__.get(name))
 
 
-def _openblas() -> bool:
-    names = np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"]  # type: ignore[index]
+def _openblas():
+    names = np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"]
     return "openblas" in names
 
 
-def _plain_libraries() -> dict[str, str]:
+def _plain_libraries():
     """Variables that take the vector units from all libraries, as far as they are here."""
     plain = {"ATEN_CPU_CAPABILITY": "default"}  # of torch
     if _x86():

@@ -3,18 +3,16 @@
 No registration uses these operations.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba
 import numpy as np
 import torch
 
-from chsel.numerics.arrays import FloatArray, digest
+from chsel.numerics.arrays import digest
 
 
-def digests() -> dict[str, str]:
+def digests():
     """Digest of each library's results for fixed arguments."""
     x = np.random.Generator(np.random.Philox(5)).random((96, 96)) + 0.1
     by_libm = [(math.exp(v), math.sin(v), math.log(v), math.pow(v, 0.3)) for v in x.reshape(-1)]
@@ -30,7 +28,7 @@ def digests() -> dict[str, str]:
 
 
 @numba.njit(fastmath={"contract"})
-def fused(x: FloatArray) -> FloatArray:
+def fused(x):
     """x^2 - x (N,), rounded once on a CPU that can multiply and add in one: never done so."""
     out = np.empty_like(x)
     for i in range(len(x)):

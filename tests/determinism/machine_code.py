@@ -1,10 +1,7 @@
 """The kernels' machine code, for this CPU and for others, and what must not be in it."""
 
-from __future__ import annotations
-
 import re
 from operator import attrgetter
-from typing import Any
 
 import llvmlite.binding as llvm
 
@@ -24,7 +21,7 @@ _FUSED = re.compile(
 )
 
 
-def optimised(dispatcher: Any) -> list[str]:
+def optimised(dispatcher):
     """The optimised LLVM code of each signature of a compiled function, callees included.
 
     Unlike numba's own way to inspect code, it also has code that was read from the cache.
@@ -33,7 +30,7 @@ def optimised(dispatcher: Any) -> list[str]:
     return [str(library._get_module_for_linking()) for library in libraries]
 
 
-def assembly(code: str, cpu: llvm.TargetMachine) -> str:
+def assembly(code, cpu):
     """What a CPU is told to do. Raises ValueError for code that is for this host alone."""
     code = _TARGET.sub("", code)
     if cpu.triple != llvm.get_process_triple():
@@ -43,17 +40,16 @@ def assembly(code: str, cpu: llvm.TargetMachine) -> str:
             raise ValueError(f"the code holds {sorted(foreign)}, which {cpu.triple} lacks")
     module = llvm.parse_assembly(code)
     module.triple, module.data_layout = cpu.triple, str(cpu.target_data)
-    text: str = cpu.emit_assembly(module)
-    return text
+    return cpu.emit_assembly(module)
 
 
-def host() -> llvm.TargetMachine:
+def host():
     """This CPU with all its features."""
     features = llvm.get_host_cpu_features().flatten()
     return target(llvm.get_process_triple(), llvm.get_host_cpu_name(), features)
 
 
-def target(triple: str, cpu: str, features: str = "") -> llvm.TargetMachine:
+def target(triple, cpu, features=""):
     """Any CPU that LLVM knows."""
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
@@ -61,16 +57,16 @@ def target(triple: str, cpu: str, features: str = "") -> llvm.TargetMachine:
     return made.create_target_machine(cpu=cpu, features=features, opt=3)
 
 
-def fused(text: str) -> list[str]:
+def fused(text):
     """The instructions in assembly that multiply and add with one rounding, x86-64 and ARM."""
     return _FUSED.findall(text)
 
 
-def loose(code: str) -> list[str]:
+def loose(code):
     """The marks in LLVM code that let a compiler change the order or number of roundings."""
     return _LOOSE.findall(code)
 
 
-def called(code: str) -> set[str]:
+def called(code):
     """The functions outside of it that LLVM code calls, but for those of Python and numba."""
     return {name for name in _DECLARED.findall(code) if not _PYTHON.match(name)}

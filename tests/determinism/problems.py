@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.sdf_grid import SdfGrid
 
@@ -26,12 +25,12 @@ class Scene:
 
 
 @cache
-def _stored() -> dict[str, FloatArray]:
+def _stored():
     with np.load(PROBLEMS_FILE) as file:
         return {name: file[name].astype(np.float64) for name in file.files}
 
 
-def grid(body: str) -> SdfGrid:
+def grid(body):
     """A new grid of a body: "bracket" has flat faces, "mallet" is round."""
     stored = _stored()
     names = ("origin", "resolution", "values", "gradients")
@@ -39,7 +38,7 @@ def grid(body: str) -> SdfGrid:
     return SdfGrid(origin, float(resolution), values, gradients)
 
 
-def scene(sdf: SdfGrid, place: str, classes: tuple[str, ...]) -> Scene:
+def scene(sdf, place, classes):
     """A place where the object of a grid is.
 
     place: "bracket" and "mallet" are tilted in space, "standing" is the bracket on a plane.

@@ -1,7 +1,5 @@
 """One process of the matrix: `python -m tests.determinism.record OUT.npz` runs all cases."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import logging
@@ -16,12 +14,12 @@ from tests.determinism import libraries
 from tests.determinism.cases import CASES
 from tests.determinism.decisions import SCENES, decision_stages
 from tests.determinism.problems import grid
-from tests.determinism.stages import Scribbler, StageKeeper, Stages, nobody, run
+from tests.determinism.stages import Scribbler, StageKeeper, nobody, run
 
 WATCHES = {"stages": StageKeeper, "nobody": nobody, "scribbler": Scribbler}
 
 
-def write_record(path: Path, record: dict[str, Stages]) -> None:
+def write_record(path, record):
     """Keep all arrays of all stages, with what the libraries compute here."""
     names, arrays = [], {}
     for case, stages in record.items():
@@ -33,9 +31,9 @@ def write_record(path: Path, record: dict[str, Stages]) -> None:
     np.savez(path, about=np.array(about), **arrays)
 
 
-def read_record(path: Path) -> tuple[dict[str, Stages], dict[str, str]]:
+def read_record(path):
     """The stages by case, and the digests of what the libraries compute."""
-    record: dict[str, Stages] = {}
+    record = {}
     with np.load(path) as file:
         about = json.loads(str(file["about"]))
         for i, (case, stage, part) in enumerate(about["names"]):
@@ -43,7 +41,7 @@ def read_record(path: Path) -> tuple[dict[str, Stages], dict[str, str]]:
     return record, about["libraries"]
 
 
-def main() -> None:
+def main():
     """Run the cases as the command line says."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)

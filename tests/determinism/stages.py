@@ -1,32 +1,20 @@
 """What a case computes, stage by stage, so that the first stage that differs can be named."""
 
-from __future__ import annotations
-
 import logging
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.objective import Objective
-from chsel.methods.method import Method
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.online_registration import pose_problem
 from chsel.problem.poses import Poses
-from chsel.problem.registration_problem import (
-    ArchiveSnapshot,
-    Hypotheses,
-    NullObserver,
-    Observer,
-    RegistrationProblem,
-)
-from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.registration_problem import NullObserver
 from chsel.problem.search_space import search_space
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd.emitters import SEARCHES
 from chsel.qd.measures import MEASURES
-from tests.determinism.cases import Case
 from tests.determinism.problems import scene
 
 Stages = dict[str, dict[str, np.ndarray]]
@@ -36,30 +24,30 @@ Stages = dict[str, dict[str, np.ndarray]]
 class Watch(Protocol):
     """Makes the observer of a step, which may add to its stages."""
 
-    def __call__(self, stages: Stages, case: Case, step: int) -> Observer:
+    def __call__(self, stages, case, step):
         """The observer of one registration."""
 
 
 class StageKeeper:
     """Keeps the state after every block of iterations as a stage."""
 
-    def __init__(self, stages: Stages, case: Case, step: int) -> None:
+    def __init__(self, stages, case, step):
         self.snapshot_interval = 25 if case.long else 5
         self._stages, self._step = stages, step
 
-    def progress(self, stage: str, iteration: int, total: int) -> None:
+    def progress(self, stage, iteration, total):
         """Nothing to keep."""
 
-    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+    def trace(self, stage, iteration, vectors, cost):
         """Vectors and costs; E_0's, and the archives of searches, are kept besides."""
         if stage not in SEARCHES and iteration > 0:
             self._keep(f"{stage} {iteration}", {"vectors": vectors.copy(), "costs": cost.copy()})
 
-    def snapshot(self, archive: ArchiveSnapshot) -> None:
+    def snapshot(self, archive):
         """The archive's range and cells."""
         self._keep(f"archive {archive.iteration}", archive_arrays(archive))
 
-    def _keep(self, name: str, arrays: dict[str, np.ndarray]) -> None:
+    def _keep(self, name, arrays):
         keep(self._stages, f"step {self._step}: {name}", arrays)
 
 
@@ -68,30 +56,30 @@ class Scribbler(NullObserver):
 
     snapshot_interval = 1
 
-    def __init__(self, stages: Stages, case: Case, step: int) -> None:
+    def __init__(self, stages, case, step):
         self._log = logging.getLogger(__name__)
 
-    def progress(self, stage: str, iteration: int, total: int) -> None:
+    def progress(self, stage, iteration, total):
         """Log it."""
         self._log.debug("%s %d of %d", stage, iteration, total)
 
-    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+    def trace(self, stage, iteration, vectors, cost):
         """Log it and spoil it."""
         self._log.debug("%s %d: lowest cost %r", stage, iteration, cost.min(initial=np.inf))
         vectors[:], cost[:] = np.nan, np.nan
 
-    def snapshot(self, archive: ArchiveSnapshot) -> None:
+    def snapshot(self, archive):
         """Log it and spoil it."""
         self._log.debug("archive %d: %r", archive.iteration, archive.coverage)
         for array in (archive.lower, archive.upper, archive.solutions, archive.measures):
             array[:] = np.nan
 
 
-def nobody(stages: Stages, case: Case, step: int) -> None:
+def nobody(stages, case, step):
     """No observer."""
 
 
-def run(case: Case, sdf: SdfGrid, watch: Any = StageKeeper) -> Stages:
+def run(case, sdf, watch=StageKeeper):
     """All stages of a case; those within a registration as far as the observer keeps them."""
     method, stages, found = case.build(), {}, None
     where = scene(sdf, case.place, case.classes)
@@ -107,7 +95,7 @@ def run(case: Case, sdf: SdfGrid, watch: Any = StageKeeper) -> Stages:
     return stages
 
 
-def _keep_start(stages: Stages, method: Method, problem: RegistrationProblem, step: int) -> None:
+def _keep_start(stages, method, problem, step):
     """E_0 and E_l, and what the kernels say about E_0."""
     sets = {"E_0": problem.initial_set, "E_l": problem.low_cost_set}
     keep(stages, f"step {step}: initial sets", sets)
@@ -132,20 +120,20 @@ def _keep_start(stages: Stages, method: Method, problem: RegistrationProblem, st
     keep(stages, f"step {step}: measures of E_0", measures)
 
 
-def _keep_result(stages: Stages, found: Hypotheses, step: int) -> None:
+def _keep_result(stages, found, step):
     if found.archive is not None:
         keep(stages, f"step {step}: last archive", archive_arrays(found.archive))
     names = ("object_from_world", "cost", "duplicate", "cell", "elites")
     keep(stages, f"step {step}: hypotheses", {name: getattr(found, name) for name in names})
 
 
-def archive_arrays(archive: ArchiveSnapshot) -> dict[str, np.ndarray]:
+def archive_arrays(archive):
     """The numbers of a snapshot."""
     names = ("lower", "upper", "cells", "solutions", "objectives", "measures")
     return {name: getattr(archive, name).copy() for name in names}
 
 
-def keep(stages: Stages, name: str, arrays: dict[str, np.ndarray]) -> None:
+def keep(stages, name, arrays):
     """Add a stage; one that comes again, in a later pass, is numbered."""
     unique, number = name, 1
     while unique in stages:

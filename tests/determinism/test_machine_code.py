@@ -1,12 +1,9 @@
 """No CPU fuses a product and a sum, as that would round once where another rounds twice."""
 
-from __future__ import annotations
-
 import importlib
 import math
 import platform
 from pathlib import Path
-from typing import Any
 
 import llvmlite.binding as llvm
 import numba
@@ -58,13 +55,13 @@ HASWELL = ("x86_64-unknown-linux-gnu", "haswell", "+avx2,+fma")
 ARM = ("aarch64-unknown-linux-gnu", "generic", "")
 
 
-def planted(x: float, y: float) -> float:
+def planted(x, y):
     """What compilers like to fuse."""
     return x * y + 1.0
 
 
 @pytest.fixture(scope="module")
-def code() -> dict[str, str]:
+def code():
     """Optimised code, with that of their callees, of the kernels that Python calls."""
     for name in ENOUGH:
         run(CASES[name], grid(CASES[name].body))
@@ -98,7 +95,7 @@ def code() -> dict[str, str]:
     }
 
 
-def _from_python() -> dict[str, Any]:
+def _from_python():
     """The kernels by full name that Python calls; elementary functions are in their callers."""
     found = {}
     for source in kernel_files():
@@ -112,7 +109,7 @@ def _from_python() -> dict[str, Any]:
     return found
 
 
-def _on(name: str) -> llvm.TargetMachine:
+def _on(name):
     """This CPU, or one of its kind that can fuse if it cannot itself; or an ARM."""
     is_x86 = platform.machine().lower() in ("x86_64", "amd64")
     if name == "ARM":
@@ -122,32 +119,30 @@ def _on(name: str) -> llvm.TargetMachine:
     return target(*HASWELL) if is_x86 and not llvm.get_host_cpu_features().get("fma") else host()
 
 
-def test_every_kernel_that_python_calls_is_looked_at(code: dict[str, str]) -> None:
+def test_every_kernel_that_python_calls_is_looked_at(code):
     kernels = _from_python()
     assert {"chsel.cost.objective.descend", "chsel.qd.emitters.me_iterations"} < set(kernels)
     assert set(kernels) == {name.split()[0] for name in code}
 
 
 @pytest.mark.parametrize("cpu", ["host", "ARM"])
-def test_no_product_is_fused_with_a_sum(cpu: str, code: dict[str, str]) -> None:
+def test_no_product_is_fused_with_a_sum(cpu, code):
     machine = _on(cpu)
     assert {name: fused(assembly(text, machine)) for name, text in code.items()} == {
         name: [] for name in code
     }
 
 
-def test_no_code_may_be_reordered(code: dict[str, str]) -> None:
+def test_no_code_may_be_reordered(code):
     assert {name: loose(text) for name, text in code.items()} == {name: [] for name in code}
 
 
-def test_no_kernel_calls_the_c_library_for_what_it_rounds_its_own_way(
-    code: dict[str, str],
-) -> None:
+def test_no_kernel_calls_the_c_library_for_what_it_rounds_its_own_way(code):
     assert set().union(*map(called, code.values())) <= EXACT
 
 
 @pytest.mark.parametrize("cpu", ["host", "ARM"])
-def test_a_fused_product_would_be_found(cpu: str) -> None:
+def test_a_fused_product_would_be_found(cpu):
     loosely = numba.njit("float64(float64, float64)", fastmath={"contract"})(planted)
     strictly = numba.njit("float64(float64, float64)")(planted)
     contracted(np.ones(3))
@@ -161,9 +156,9 @@ def test_a_fused_product_would_be_found(cpu: str) -> None:
     assert not fused(assembly(text, machine))
 
 
-def test_a_call_of_the_c_library_would_be_found() -> None:
+def test_a_call_of_the_c_library_would_be_found():
     @numba.njit("float64(float64)")
-    def inexact(x: float) -> float:
+    def inexact(x):
         return math.exp(x) + math.sin(x)
 
     (text,) = optimised(inexact)
@@ -172,13 +167,13 @@ def test_a_call_of_the_c_library_would_be_found() -> None:
     assert any("sin" in name for name in names)
 
 
-def test_code_from_the_cache_is_seen_as_freshly_compiled_code_is() -> None:
-    function = _remainder.py_func  # type: ignore[attr-defined]
+def test_code_from_the_cache_is_seen_as_freshly_compiled_code_is():
+    function = _remainder.py_func
     fresh = numba.njit(nogil=True, error_model="numpy")(function)
     compiled(function)(10.0)
     cached = compiled(function)
     assert fresh(10.0) == cached(10.0) == 10.0 - 2.0 * math.pi
-    assert cached.stats.cache_hits  # type: ignore[attr-defined]
+    assert cached.stats.cache_hits
     assert not fresh.stats.cache_hits
     products = [assembly(*optimised(made), host()).count("mul") for made in (fresh, cached)]
     assert products[0] == products[1] > 0

@@ -1,8 +1,5 @@
 """The same bits on every thread count, CPU and library, whoever watches: against golden.json."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -25,7 +22,7 @@ Record = tuple[dict[str, Stages], dict[str, str]]
 
 
 @pytest.fixture(scope="module")
-def record_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Record]:
+def record_of(tmp_path_factory):
     """What a setting gives, in a process of its own, each once."""
     directory = tmp_path_factory.mktemp("records")
     return cache(lambda name: ENVIRONMENTS[name].record(directory / name.replace(" ", "_")))
@@ -35,7 +32,7 @@ OTHERS = [pytest.param(name, marks=pytest.mark.slow) for name in list(ENVIRONMEN
 
 
 @pytest.mark.parametrize("name", ["default", *OTHERS])
-def test_every_bit_is_as_in_the_golden_file(name: str, record_of: Callable[[str], Record]) -> None:
+def test_every_bit_is_as_in_the_golden_file(name, record_of):
     usual, _ = record_of("default")
     record, _ = record_of(name)
     found = differences(read_golden(), record, usual)
@@ -45,9 +42,7 @@ def test_every_bit_is_as_in_the_golden_file(name: str, record_of: Callable[[str]
 
 
 @pytest.mark.slow
-def test_the_settings_for_other_cpus_do_reach_the_compiler(
-    record_of: Callable[[str], Record],
-) -> None:
+def test_the_settings_for_other_cpus_do_reach_the_compiler(record_of):
     """By a kernel that is compiled as no kernel of chsel is: it fuses where the CPU can."""
     generic, haswell = list(ENVIRONMENTS)[1:3]
     if not ENVIRONMENTS[haswell].variables:
@@ -57,7 +52,7 @@ def test_the_settings_for_other_cpus_do_reach_the_compiler(
     assert plain != usual == fused
 
 
-def test_the_cases_meet_every_choice_at_least_once() -> None:
+def test_the_cases_meet_every_choice_at_least_once():
     settings = [case.build().settings for case in CASES.values()]
     searches = [made for made in settings if isinstance(made, ChselSettings)]
     every = [getattr(made, "cost", None) for made in settings]
@@ -78,7 +73,7 @@ def test_the_cases_meet_every_choice_at_least_once() -> None:
     assert {made.plane is not None for made in searches} == {True, False}
 
 
-def _one_bit_off(record: dict[str, Stages], case: str, stage: str, part: str) -> dict[str, Stages]:
+def _one_bit_off(record, case, stage, part):
     stages = {**record[case], stage: {**record[case][stage]}}
     array = stages[stage][part].copy()
     array.flat[-1] = np.nextafter(array.flat[-1], np.inf)
@@ -86,8 +81,8 @@ def _one_bit_off(record: dict[str, Stages], case: str, stage: str, part: str) ->
     return {**record, case: stages}
 
 
-def test_one_wrong_bit_is_found_and_said_where() -> None:
-    stages: Stages = {
+def test_one_wrong_bit_is_found_and_said_where():
+    stages = {
         "step 0: costs of E_0": {"costs": np.array([1.0, 2.0, 3.0])},
         "step 0: hypotheses": {"cost": np.array([0.5, 0.0]), "cell": np.array([3, 4])},
     }
@@ -113,7 +108,7 @@ def test_one_wrong_bit_is_found_and_said_where() -> None:
     assert differences(golden, {"first": stages}) == ["second: not recorded"]
 
 
-def test_ulps_count_the_numbers_between() -> None:
+def test_ulps_count_the_numbers_between():
     left = np.array([1.0, 0.0, -0.0, 5e-324, -1.0, 1.5])
     right = np.array([1.0 + 2.0**-51, -0.0, 5e-324, -5e-324, -1.0 - 2.0**-52, 1.5])
     assert ulps(left, right).tolist() == [2, 1, 2, 3, 1, 0]

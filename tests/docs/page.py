@@ -1,7 +1,5 @@
 """The files and commands on a page of docs/, as a reader would take them over."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -13,13 +11,13 @@ _BLOCK = re.compile(r"^```(?P<language>\w+)\n(?P<text>.*?)^```$", re.DOTALL | re
 _NAMED = re.compile(r"`(?P<name>[\w./-]+\.\w+)`:\n\n\Z")
 
 
-def section(page: str, title: str) -> str:
+def section(page, title):
     """The text of a page below a heading of the second level, up to the next."""
     sections = re.split(r"^## (.+)\n", (DOCS / page).read_text(), flags=re.MULTILINE)
     return dict(zip(sections[1::2], sections[2::2], strict=True))[title]
 
 
-def write_files(page: str, folder: Path) -> list[Path]:
+def write_files(page, folder):
     """Write every block of a page that a line such as "`name.py`:" stands before; their paths."""
     text, written = (DOCS / page).read_text(), []
     for block in _BLOCK.finditer(text):
@@ -31,14 +29,14 @@ def write_files(page: str, folder: Path) -> list[Path]:
     return written
 
 
-def commands(page: str) -> list[str]:
+def commands(page):
     """The lines of all sh blocks of a page, in order; lines that a backslash continues are one."""
     blocks = _BLOCK.finditer((DOCS / page).read_text())
     joined = "".join(block["text"] for block in blocks if block["language"] == "sh")
     return joined.replace("\\\n", " ").splitlines()
 
 
-def shell(command: str, folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+def shell(command, folder, **variables):
     """Run a command of a page in a folder; pip installs into its folder `site`, and offline."""
     binaries = str(Path(sys.executable).parent)
     environment = {

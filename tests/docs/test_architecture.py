@@ -1,14 +1,12 @@
 """docs/architecture.md names files and classes that exist."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-def test_files_and_classes_that_the_page_names_exist() -> None:
+def test_files_and_classes_that_the_page_names_exist():
     page = (REPOSITORY / "docs" / "architecture.md").read_text()
     words = set(re.findall(r"`([\w./-]+)`", re.sub(r"^```.*?^```$", "", page, flags=re.M | re.S)))
     folders = ("chsel", "conf", "replay", "runners", "tests")

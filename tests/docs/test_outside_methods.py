@@ -1,9 +1,5 @@
 """docs/outside_methods.md: what stands there is what a user does, and the table has his rows."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pyarrow.parquet as parquet
 import pytest
 
@@ -13,7 +9,7 @@ pytestmark = pytest.mark.slow
 PAGE = "outside_methods.md"
 
 
-def test_a_program_that_knows_nothing_of_this_package_is_ranked(tmp_path: Path) -> None:
+def test_a_program_that_knows_nothing_of_this_package_is_ranked(tmp_path):
     (program,) = write_files(PAGE, tmp_path)
     assert "chsel" not in program.read_text()
     for command in commands(PAGE):

@@ -1,11 +1,7 @@
 """docs/presets.md: its tables have every setting in which presets differ, with its values."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,12 +16,12 @@ from tests.docs.page import DOCS
 ORDER = ("paper", "reference", "default")
 PAGE = (DOCS / "presets.md").read_text()
 TABLE = re.compile(
-    r"Of (?P<of>[^.:]+):\n\n\| setting \| paper \|.*\n\|[-|]+\|\n(?P<rows>(?:\|.*\n)+)",
+    r"Of (?P<of>[^.:]+):\n\n\| setting \| paper \|.*\n\|[-|]+\|\n(?P<rows>(?:\|.*\n)+)"
 )
 PRINTED = re.compile(r"^\| [^|]+ \| `(?P<setting>[\w.]+)` \| (?P<value>[-\d.]+) \|$", re.MULTILINE)
 
 
-def settings_of(name: str) -> list[Any]:
+def settings_of(name):
     """The settings of a method, a session or a definition in each preset."""
     if name == "session":
         return [in_preset(ProbingSettings(), preset) for preset in ORDER]
@@ -34,7 +30,7 @@ def settings_of(name: str) -> list[Any]:
     return [preset_settings(name, preset) for preset in ORDER]
 
 
-def differences(settings: list[Any], path: str = "") -> Iterator[tuple[str, list[Any]]]:
+def differences(settings, path=""):
     """Dotted names and values of all fields in which settings of one class are not equal."""
     for field in fields(settings[0]):
         values = [getattr(one, field.name) for one in settings]
@@ -45,7 +41,7 @@ def differences(settings: list[Any], path: str = "") -> Iterator[tuple[str, list
             yield name, values
 
 
-def on_the_page() -> dict[tuple[str, str], list[str]]:
+def on_the_page():
     """Cells of paper, reference and default by method and setting."""
     found = {}
     for table in TABLE.finditer(PAGE):
@@ -59,7 +55,7 @@ def on_the_page() -> dict[tuple[str, str], list[str]]:
     return found
 
 
-def same(cell: str, value: Any) -> bool:
+def same(cell, value):
     """Whether a cell, in YAML, shows a value; numbers to four digits."""
     if is_dataclass(value):
         return cell == type(value).__name__
@@ -72,7 +68,7 @@ def same(cell: str, value: Any) -> bool:
 
 
 @pytest.mark.parametrize("name", [*OURS, "session", "definition"])
-def test_every_setting_in_which_presets_differ_is_on_the_page(name: str) -> None:
+def test_every_setting_in_which_presets_differ_is_on_the_page(name):
     page = {setting: cells for (of, setting), cells in on_the_page().items() if of == name}
     code = dict(differences(settings_of(name)))
     assert sorted(page) == sorted(code)
@@ -81,7 +77,7 @@ def test_every_setting_in_which_presets_differ_is_on_the_page(name: str) -> None
             assert same(cell, value), f"{name}, {setting}, {preset}: {cell} for {value}"
 
 
-def test_printed_numbers_are_those_of_all_presets() -> None:
+def test_printed_numbers_are_those_of_all_presets():
     printed = {row["setting"]: float(row["value"]) for row in PRINTED.finditer(PAGE)}
     assert len(printed) == 7
     for setting, value in printed.items():
@@ -91,5 +87,5 @@ def test_printed_numbers_are_those_of_all_presets() -> None:
             assert settings == pytest.approx(value), setting
 
 
-def test_the_tables_that_are_compared_are_all_of_the_page() -> None:
+def test_the_tables_that_are_compared_are_all_of_the_page():
     assert len(list(TABLE.finditer(PAGE))) == PAGE.count("| setting | paper |")

@@ -1,7 +1,5 @@
 """The speed that the README shows is that of the benchmark's page, docs/speed.md."""
 
-from __future__ import annotations
-
 import re
 
 from tests.docs.page import DOCS
@@ -18,12 +16,12 @@ _NAMES = {
 }
 
 
-def table_rows(text: str) -> list[list[str]]:
+def table_rows(text):
     lines = [line for line in text.splitlines() if re.fullmatch(r"\|.*[^-|: ].*\|", line)]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
-def test_times_in_the_readme_are_those_of_the_page() -> None:
+def test_times_in_the_readme_are_those_of_the_page():
     readme = (DOCS.parent / "README.md").read_text()
     section = readme.partition("\n## Speed\n")[2].partition("\n## ")[0]
     header, *rows = table_rows(section)

@@ -1,9 +1,5 @@
 """docs/writing_a_method.md: what stands there is what a user does, and it replays."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -18,7 +14,7 @@ PAGE = "writing_a_method.md"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A folder in which everything on the page was done."""
     folder = tmp_path_factory.mktemp("method")
     write_files(PAGE, folder)
@@ -28,14 +24,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def recording(folder: Path, rounds: int) -> Path:
+def recording(folder, rounds):
     for file in folder.glob("logs/probe/*/recording.mcap"):
         if read_recording(file).start.config["method"]["rounds"] == rounds:
             return file
     raise AssertionError(f"no recording of {rounds} rounds")
 
 
-def test_a_session_is_recorded_with_the_method_and_its_settings(folder: Path) -> None:
+def test_a_session_is_recorded_with_the_method_and_its_settings(folder):
     read = read_recording(recording(folder, 50))
     assert read.start.method == "hill_climb"
     assert read.start.config["method"]["rotation"] == 0.3
@@ -46,7 +42,7 @@ def test_a_session_is_recorded_with_the_method_and_its_settings(folder: Path) ->
     assert found.cost[0] < read.hypotheses(first).cost[-1]
 
 
-def test_no_start_ends_at_a_higher_cost(folder: Path) -> None:
+def test_no_start_ends_at_a_higher_cost(folder):
     read = read_recording(recording(folder, 50))
     for step in read.steps:
         problem, found = read.problem(step), read.hypotheses(step)
@@ -55,12 +51,12 @@ def test_no_start_ends_at_a_higher_cost(folder: Path) -> None:
         assert found.cost.sum() < before.sum()
 
 
-def test_a_named_set_of_settings_is_a_file(folder: Path) -> None:
+def test_a_named_set_of_settings_is_a_file(folder):
     config = read_recording(recording(folder, 10)).start.config["method"]
     assert (config["name"], config["rotation"], config["translation"]) == ("hill_climb", 0.6, 0.03)
 
 
-def test_verify_finds_a_method_that_was_changed(folder: Path) -> None:
+def test_verify_finds_a_method_that_was_changed(folder):
     path = recording(folder, 10)
     installed = folder / "site" / "hill_climb.py"
     source = installed.read_text()
@@ -73,7 +69,7 @@ def test_verify_finds_a_method_that_was_changed(folder: Path) -> None:
     assert "first difference: climb, iteration 10" in done.stdout
 
 
-def test_without_the_package_the_recording_can_still_be_read(folder: Path, tmp_path: Path) -> None:
+def test_without_the_package_the_recording_can_still_be_read(folder, tmp_path):
     path, exported = str(recording(folder, 10)), str(tmp_path / "out.json")
     assert run(replay, "info", path).returncode == 0
     export = ("export", path, "--what", "hypotheses", "--format", "json", "-o", exported)
@@ -91,7 +87,7 @@ def test_without_the_package_the_recording_can_still_be_read(folder: Path, tmp_p
         ("icp = mine:Mine", "", "method icp is of package mine, too; accepted: one of"),
     ],
 )
-def test_what_is_no_method_is_one_line(tmp_path: Path, line: str, code: str, message: str) -> None:
+def test_what_is_no_method_is_one_line(tmp_path, line, code, message):
     """Of a package as pip installs it: a module, and a folder that says what it offers."""
     about = tmp_path / "site" / "mine-1.dist-info"
     about.mkdir(parents=True)

@@ -1,9 +1,5 @@
 """docs/writing_a_policy.md: what stands there is what a user does, and it replays."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -18,7 +14,7 @@ PAGE = "writing_a_policy.md"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A folder in which everything on the page was done."""
     folder = tmp_path_factory.mktemp("policy")
     write_files(PAGE, folder)
@@ -28,7 +24,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_first_probe_is_by_entropy_and_those_after_by_information(folder: Path) -> None:
+def test_the_first_probe_is_by_entropy_and_those_after_by_information(folder):
     (path,) = folder.glob("logs/probe/*/recording.mcap")
     read = read_recording(path)
     assert read.start.config["policy"]["name"] == "entropy_first"
@@ -44,7 +40,7 @@ def test_the_first_probe_is_by_entropy_and_those_after_by_information(folder: Pa
         assert np.array_equal(event.decision.score[taken], expected[taken])
 
 
-def test_without_the_package_a_decision_is_not_made_again(folder: Path) -> None:
+def test_without_the_package_a_decision_is_not_made_again(folder):
     (path,) = folder.glob("logs/probe/*/recording.mcap")
     done = shell(f"python -m replay verify {path}", folder, PYTHONPATH="")
     assert done.returncode == 2, done.stdout

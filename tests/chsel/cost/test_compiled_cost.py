@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +30,7 @@ BOX_SIDES = (0.12, 0.08, 0.06)
 
 
 @cache
-def grid_of(name: str) -> SdfGrid:
+def grid_of(name):
     if name == "sphere":
         return ball_grid(0.05, 0.01, 9)
     if name == "box":
@@ -55,10 +53,10 @@ class Case:
     space: SearchSpace
 
     @property
-    def sdf(self) -> SdfGrid:
+    def sdf(self):
         return grid_of(self.shape)
 
-    def objective(self, culling: str = "octree") -> Objective:
+    def objective(self, culling="octree"):
         cost = CompiledCost(
             self.sdf,
             self.points,
@@ -68,13 +66,13 @@ class Case:
         )
         return Objective(cost, self.space)
 
-    def other_cullings(self) -> list[Objective]:
+    def other_cullings(self):
         """Every culling but the default."""
         return [self.objective("none")]
 
 
 @st.composite
-def cases(draw: st.DrawFn, free_terms: tuple[str, ...] = ("direct", "interior")) -> Case:
+def cases(draw, free_terms=("direct", "interior")):
     stream = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     shape = draw(st.sampled_from(["sphere", "box", "l_shape"]))
     resolution = draw(st.sampled_from([0.01, 0.022, 0.03]))
@@ -97,7 +95,7 @@ def cases(draw: st.DrawFn, free_terms: tuple[str, ...] = ("direct", "interior"))
     occupied = stream.uniform(-0.15, 0.15, (draw(st.integers(0, 6)), 3))
     points = KnownPoints(free, occupied, known, stream.uniform(-0.03, 0.03, len(known)))
     count, reach = draw(st.integers(1, 9)), draw(st.sampled_from([0.03, 0.1, 0.4]))
-    space: SearchSpace = SE3Space()
+    space = SE3Space()
     if draw(st.integers(0, 3)) == 0:
         axis = tuple(stream.standard_normal(3).tolist())
         space = SE2Space(PlaneSettings(axis=axis, offset=0.01), grid_of(shape))
@@ -107,7 +105,7 @@ def cases(draw: st.DrawFn, free_terms: tuple[str, ...] = ("direct", "interior"))
     return Case(shape, points, changes, resolution, vectors, space)
 
 
-def oracle(cost: RelaxedCost, space: SearchSpace, vectors: FloatArray) -> list[FloatArray]:
+def oracle(cost, space, vectors):
     """Costs (B,) and gradients (B, d) by torch."""
     leaves = torch.tensor(vectors, requires_grad=True)
     values = cost(*decode(space, leaves))
@@ -116,7 +114,7 @@ def oracle(cost: RelaxedCost, space: SearchSpace, vectors: FloatArray) -> list[F
     return [values.detach().numpy(), leaves.grad.numpy()]
 
 
-def assert_equals_torch(case: Case) -> None:
+def assert_equals_torch(case):
     cost = RelaxedCost(case.sdf, case.points, case.settings, free_resolution=case.free_resolution)
     values, gradients = oracle(cost, case.space, case.vectors)
     found, slopes = case.objective().costs_and_gradients(case.vectors)
@@ -125,7 +123,7 @@ def assert_equals_torch(case: Case) -> None:
     np.testing.assert_allclose(slopes / size, gradients / size, rtol=0.0, atol=1e-12)
 
 
-def assert_same_bits(first: object, second: object) -> None:
+def assert_same_bits(first, second):
     for one, other in zip(np.atleast_1d(first), np.atleast_1d(second), strict=True):
         one, other = np.asarray(one), np.asarray(other)
         assert one.shape == other.shape
@@ -134,13 +132,13 @@ def assert_same_bits(first: object, second: object) -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(case=cases())
-def test_costs_and_gradients_are_those_of_the_torch_cost(case: Case) -> None:
+def test_costs_and_gradients_are_those_of_the_torch_cost(case):
     assert_equals_torch(case)
 
 
 @settings(max_examples=100, deadline=None)
 @given(case=cases())
-def test_culling_batches_threads_and_gradients_change_no_bit(case: Case) -> None:
+def test_culling_batches_threads_and_gradients_change_no_bit(case):
     objective, vectors = case.objective(), case.vectors
     costs, gradients = objective.costs_and_gradients(vectors)
     for other in case.other_cullings():
@@ -160,9 +158,7 @@ def test_culling_batches_threads_and_gradients_change_no_bit(case: Case) -> None
         assert_same_bits(slopes, gradients)
 
 
-def descended_plainly(
-    objective: Objective, vectors: FloatArray, divisor: float, rate: float, iterations: int
-) -> FloatArray:
+def descended_plainly(objective, vectors, divisor, rate, iterations):
     """Adam, asking all points at every step; the operations are those of the kernel."""
     mean, square = np.zeros_like(vectors), np.zeros_like(vectors)
     power1 = power2 = 1.0
@@ -179,13 +175,8 @@ def descended_plainly(
 
 
 @settings(max_examples=100, deadline=None)
-@given(
-    case=cases(),
-    rate=st.sampled_from([1e-4, 1e-3, 0.01, 0.1, 1.0]),
-)
-def test_descent_with_neighbour_lists_is_to_the_bit_descent_over_all_points(
-    case: Case, rate: float
-) -> None:
+@given(case=cases(), rate=st.sampled_from([1e-4, 1e-3, 0.01, 0.1, 1.0]))
+def test_descent_with_neighbour_lists_is_to_the_bit_descent_over_all_points(case, rate):
     plain = descended_plainly(case.objective("none"), case.vectors, 3.0, rate, 40)
     for other in case.other_cullings():
         assert_same_bits(other.descended(case.vectors, 3.0, rate, 40), plain)
@@ -198,16 +189,14 @@ def test_descent_with_neighbour_lists_is_to_the_bit_descent_over_all_points(
 class Turntable(SE2Space):
     """A plane on which the object can only turn."""
 
-    def __init__(self, sdf: SdfGrid) -> None:
+    def __init__(self, sdf):
         super().__init__(PlaneSettings(offset=0.0), sdf)
         self.arrays = self.arrays._replace(e_u=(0.0, 0.0, 0.0), e_v=(0.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize("turn", [0.004, 0.02, 0.1])
 @pytest.mark.parametrize("free_term", ["direct", "interior"])
-def test_an_object_that_turns_misses_none_of_the_points_that_it_sweeps(
-    free_term: str, turn: float
-) -> None:
+def test_an_object_that_turns_misses_none_of_the_points_that_it_sweeps(free_term, turn):
     """Contacts far away turn it by about `turn` radians a step, at first."""
     free = np.random.default_rng(14).uniform(-0.2, 0.2, (100_000, 3)) * [1.0, 1.0, 0.2]
     points = KnownPoints(free, known=[[0.0, 3.0, 0.0], [0.1, -3.0, 0.0]])
@@ -220,7 +209,7 @@ def test_an_object_that_turns_misses_none_of_the_points_that_it_sweeps(
     assert_same_bits(case.objective().descended(vectors, 1.0, turn, 50), plain)
 
 
-def test_an_object_that_comes_into_free_space_from_outside_misses_none_of_its_points() -> None:
+def test_an_object_that_comes_into_free_space_from_outside_misses_none_of_its_points():
     """A corner of a box comes first, where a sphere around the box fits it best."""
     corner = np.array(BOX_SIDES) / 2.0
     x = corner / np.linalg.norm(corner)
@@ -242,13 +231,13 @@ def test_an_object_that_comes_into_free_space_from_outside_misses_none_of_its_po
     assert (free_alone.costs(plain) > 0.0).sum() > 5
 
 
-def test_by_default_alpha_is_a_quarter_of_a_free_voxel_or_half_of_the_greatest_depth() -> None:
+def test_by_default_alpha_is_a_quarter_of_a_free_voxel_or_half_of_the_greatest_depth():
     sdf = grid_of("sphere")  # 5 cm deep
     for resolution, alpha in ((0.02, -0.005), (0.4, -0.025)):
         assert CostSettings().of_object(sdf, resolution).alpha == pytest.approx(alpha)
 
 
-def summed_over_all(cost: CompiledCost, sdf: SdfGrid, free: FloatArray, pose: FloatArray) -> float:
+def summed_over_all(cost, sdf, free, pose):
     """Eq. 8 over every free point, one after the other in the order of the tree."""
     x, y, z = free[cost.model.free.tree.order].T
     moved = [
@@ -260,20 +249,18 @@ def summed_over_all(cost: CompiledCost, sdf: SdfGrid, free: FloatArray, pose: Fl
     return float(np.add.accumulate(changes.free_scale * violation)[-1])
 
 
-def lattice_points() -> FloatArray:
+def lattice_points():
     axis = (np.arange(59) - 29) * 0.005
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)[:200_000]
 
 
-def scattered_points() -> FloatArray:
+def scattered_points():
     return np.random.default_rng(3).uniform(-0.2, 0.2, (200_000, 3))
 
 
 @pytest.mark.parametrize("lookup", ["nearest", "trilinear"])
 @pytest.mark.parametrize("make", [lattice_points, scattered_points])
-def test_200_000_free_points_cost_to_the_bit_what_their_sum_one_by_one_is(
-    make: Callable[[], FloatArray], lookup: str
-) -> None:
+def test_200_000_free_points_cost_to_the_bit_what_their_sum_one_by_one_is(make, lookup):
     sdf, free, stream = grid_of("l_shape"), make(), np.random.default_rng(4)
     changes = CostSettings(lookup=lookup)
     transforms = random_poses(stream, 5, 0.2)
@@ -289,7 +276,7 @@ def test_200_000_free_points_cost_to_the_bit_what_their_sum_one_by_one_is(
     assert_same_bits(costs, [summed_over_all(culled, sdf, free, pose) for pose in poses.numbers])
 
 
-def border_points(sdf: SdfGrid) -> FloatArray:
+def border_points(sdf):
     """Nodes, middles between them, corners of the grid, and the numbers next to all of these."""
     stream, (first, last) = np.random.default_rng(5), sdf.bounds
     nodes = stream.integers(0, np.array(sdf.shape), (300, 3))
@@ -306,8 +293,8 @@ def border_points(sdf: SdfGrid) -> FloatArray:
 @pytest.mark.parametrize("outside", ["surface_point", "bounding_box"])
 @pytest.mark.parametrize("lookup", ["nearest", "trilinear"])
 def test_points_on_borders_of_voxels_and_of_the_grid_read_what_the_torch_cost_reads(
-    lookup: str, outside: str, gradient: str
-) -> None:
+    lookup, outside, gradient
+):
     sdf = grid_of("dyadic")
     changes = CostSettings(lookup=lookup, outside=outside, gradient=gradient)
     at = border_points(sdf)
@@ -323,7 +310,7 @@ def test_points_on_borders_of_voxels_and_of_the_grid_read_what_the_torch_cost_re
             assert_equals_torch(Case("dyadic", points, changes, sdf.resolution, one, SE3Space()))
 
 
-def test_free_voxels_are_read_on_their_borders_as_the_torch_cost_reads_them() -> None:
+def test_free_voxels_are_read_on_their_borders_as_the_torch_cost_reads_them():
     step = 2.0**-6
     free = np.array([[0.0, 0.0, 0.0], [step, 0.0, 0.0], [0.0, 2 * step, step], [3 * step, 0, 0]])
     changes = CostSettings(free_term="interior", interior_spacing=0.5 * step)
@@ -334,7 +321,7 @@ def test_free_voxels_are_read_on_their_borders_as_the_torch_cost_reads_them() ->
     assert_equals_torch(case)
 
 
-def edge_points(name: str) -> KnownPoints:
+def edge_points(name):
     stream = np.random.default_rng(6)
     near, none = stream.uniform(-0.08, 0.08, (60, 3)), np.zeros((0, 3))
     known_sdf = stream.uniform(-0.02, 0.02, 60)
@@ -371,7 +358,7 @@ EDGES = [
     [(name, term) for name in EDGES for term in ("direct", "interior")]
     + [("in two clusters 1000 km apart", "direct")],  # too many voxels for the other
 )
-def test_rare_sets_of_points_cost_what_the_torch_cost_says(name: str, free_term: str) -> None:
+def test_rare_sets_of_points_cost_what_the_torch_cost_says(name, free_term):
     stream = np.random.default_rng(7)
     vectors = SE3Space().encode(Poses.of(random_poses(stream, 4, 0.02)))
     changes = CostSettings(free_term=free_term)
@@ -388,7 +375,7 @@ def test_rare_sets_of_points_cost_what_the_torch_cost_says(name: str, free_term:
 
 @pytest.mark.parametrize("free_term", ["direct", "interior"])
 @pytest.mark.parametrize("far", [1e6, 6.4e6, 1e9])
-def test_a_scene_far_from_the_origin_is_culled_without_loss(far: float, free_term: str) -> None:
+def test_a_scene_far_from_the_origin_is_culled_without_loss(far, free_term):
     """At 1e9 m, neighbouring doubles are 0.1 micrometres apart."""
     stream = np.random.default_rng(8)
     shift = np.array([far, -far, 0.5 * far])
@@ -410,8 +397,8 @@ def test_a_scene_far_from_the_origin_is_culled_without_loss(far: float, free_ter
 @pytest.mark.parametrize("free_term", ["direct", "interior"])
 @pytest.mark.parametrize("bad", [np.nan, -np.inf, 1e300])
 def test_a_pose_that_is_not_finite_leaves_the_lanes_beside_it_to_the_bit_as_they_are(
-    bad: float, free_term: str
-) -> None:
+    bad, free_term
+):
     stream = np.random.default_rng(16)
     near = stream.uniform(-0.1, 0.1, (900, 3))
     points = KnownPoints(near, near[:3], near[:9])
@@ -436,7 +423,7 @@ def test_a_pose_that_is_not_finite_leaves_the_lanes_beside_it_to_the_bit_as_they
         assert_same_bits(objective.descended(spoiled, 3.0, 0.01, 20)[others], moved[others])
 
 
-def test_an_sdf_that_32_bits_cannot_hold_is_read_in_64_bits() -> None:
+def test_an_sdf_that_32_bits_cannot_hold_is_read_in_64_bits():
     sdf = grid_of("sphere")
     node = np.array([[0.03, 0.01, 0.02]])
     cost = CompiledCost(sdf, KnownPoints(known=node), CostSettings(lookup="nearest"))
@@ -445,7 +432,7 @@ def test_an_sdf_that_32_bits_cannot_hold_is_read_in_64_bits() -> None:
     assert cost.evaluate(np.eye(4)[None])[0] == pytest.approx(abs(value), rel=1e-14)
 
 
-def test_tolerance_zero_charges_every_free_point_inside_of_the_object() -> None:
+def test_tolerance_zero_charges_every_free_point_inside_of_the_object():
     stream = np.random.default_rng(11)
     sdf, free = grid_of("sphere"), stream.uniform(-0.08, 0.08, (500, 3))
     changes = CostSettings(penetration_tolerance=0.0, lookup="nearest")
@@ -455,12 +442,12 @@ def test_tolerance_zero_charges_every_free_point_inside_of_the_object() -> None:
     np.testing.assert_allclose(cost, 20.0 * depth.sum(), rtol=1e-12)
 
 
-def test_tolerance_deeper_than_the_object_is_a_warning_and_costs_free_points_nothing() -> None:
+def test_tolerance_deeper_than_the_object_is_a_warning_and_costs_free_points_nothing():
     changes = CostSettings(penetration_tolerance=-0.2)
     free = np.random.default_rng(12).uniform(-0.05, 0.05, (100, 3))
     for made in (RelaxedCost, CompiledCost):
         with pytest.warns(UserWarning, match="cannot be violated"):
-            cost: Any = made(grid_of("box"), KnownPoints(free), changes)
+            cost = made(grid_of("box"), KnownPoints(free), changes)
     assert cost.evaluate(np.eye(4)[None])[0] == 0.0
     objective = Objective(cost, SE3Space())
     vectors = SE3Space().encode(Poses.of(np.eye(4)[None]))
@@ -472,20 +459,20 @@ def test_tolerance_deeper_than_the_object_is_a_warning_and_costs_free_points_not
 
 @pytest.mark.filterwarnings("ignore:.*cannot be violated")
 @pytest.mark.parametrize("cost", [CompiledCost, RelaxedCost])
-def test_an_interior_term_without_interior_points_says_what_to_do(cost: Any) -> None:
+def test_an_interior_term_without_interior_points_says_what_to_do(cost):
     changes = CostSettings(free_term="interior", penetration_tolerance=-0.2)
     with pytest.raises(SettingError, match="penetration_tolerance nearer to 0"):
         cost(grid_of("box"), KnownPoints([[0.0, 0.0, 0.0]]), changes)
 
 
-def test_free_voxels_that_span_too_much_are_an_error() -> None:
+def test_free_voxels_that_span_too_much_are_an_error():
     changes = CostSettings(free_term="interior")
     with pytest.raises(SettingError, match="coarser free_resolution"):
         CompiledCost(grid_of("box"), KnownPoints([[0.0, 0.0, 0.0], [1e9, 1e9, 1e9]]), changes)
 
 
 @pytest.mark.parametrize("cost", [CompiledCost, RelaxedCost])
-def test_transforms_of_another_shape_are_refused(cost: type[CompiledCost | RelaxedCost]) -> None:
+def test_transforms_of_another_shape_are_refused(cost):
     sdf = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.1, 0.1)), 0.01)
     made = cost(sdf, KnownPoints(known=np.zeros((1, 3))))
     with pytest.raises(PoseError, match=r"has shape \(4, 4\); accepted: \(any, 4, 4\)"):

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -23,15 +21,13 @@ ORIGIN = torch.zeros((1, 3), dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
-def sphere() -> SdfGrid:
+def sphere():
     """Exact signed distance of a sphere at nodes that hold the points of the closed forms."""
     return ball_grid(RADIUS, 0.01, 25)
 
 
-def value_and_translation_gradient(
-    sphere: SdfGrid, points: KnownPoints, **changes: object
-) -> tuple[float, np.ndarray]:
-    ours = replace(CostSettings(penetration_tolerance=-0.01), **changes)  # type: ignore[arg-type]
+def value_and_translation_gradient(sphere, points, **changes):
+    ours = replace(CostSettings(penetration_tolerance=-0.01), **changes)
     cost = RelaxedCost(sphere, points, ours)
     translation = ORIGIN.clone().requires_grad_()
     value = cost(EYE, translation)
@@ -55,9 +51,7 @@ def value_and_translation_gradient(
         (KnownPoints(known=[[0, 0, -0.13]], known_sdf=[-0.02]), 0.05, [0, 0, -0.05]),
     ],
 )
-def test_terms_of_a_sphere_have_their_closed_form(
-    sphere: SdfGrid, points: KnownPoints, value: float, gradient: list[float], lookup: str
-) -> None:
+def test_terms_of_a_sphere_have_their_closed_form(sphere, points, value, gradient, lookup):
     found, slope = value_and_translation_gradient(sphere, points, lookup=lookup)
     assert found == pytest.approx(value, abs=1e-9)
     np.testing.assert_allclose(slope, gradient, atol=1e-9)
@@ -70,7 +64,7 @@ def test_terms_of_a_sphere_have_their_closed_form(
     np.testing.assert_allclose(gradients[0, 6:], gradient, atol=1e-9)
 
 
-def test_dead_band_shrinks_the_difference_towards_zero(sphere: SdfGrid) -> None:
+def test_dead_band_shrinks_the_difference_towards_zero(sphere):
     points = KnownPoints(known=[[0.13, 0, 0], [0.105, 0, 0]])
     value, gradient = value_and_translation_gradient(
         sphere, points, known_tolerance=0.01, lookup="trilinear"
@@ -79,7 +73,7 @@ def test_dead_band_shrinks_the_difference_towards_zero(sphere: SdfGrid) -> None:
     np.testing.assert_allclose(gradient, [0.02, 0, 0], atol=1e-9)
 
 
-def test_exact_gradient_is_the_derivative_of_the_value(sphere: SdfGrid) -> None:
+def test_exact_gradient_is_the_derivative_of_the_value(sphere):
     points = KnownPoints(free=[[0.0512, 0, 0]], occupied=[[0, 0.181, 0]], known=[[0, 0, 0.131]])
     for axis in range(3):
         step = np.eye(3)[axis] * 1e-4
@@ -91,14 +85,12 @@ def test_exact_gradient_is_the_derivative_of_the_value(sphere: SdfGrid) -> None:
         assert gradient[axis] == pytest.approx((moved[1] - moved[0]) / 2e-4, rel=1e-3, abs=1e-6)
 
 
-def shifted(points: KnownPoints, by: np.ndarray) -> KnownPoints:
+def shifted(points, by):
     return KnownPoints(points.free + by, points.occupied + by, points.known + by, points.sdf)
 
 
 @pytest.mark.parametrize("free_term", ["direct", "interior"])
-def test_gradient_by_the_search_vector_is_the_defined_point_gradient_chain_ruled(
-    sphere: SdfGrid, free_term: str
-) -> None:
+def test_gradient_by_the_search_vector_is_the_defined_point_gradient_chain_ruled(sphere, free_term):
     """J^T g, with J = d(R x + t)/dx by finite differences of the moved points alone."""
     stream = np.random.default_rng(0)
     points = KnownPoints(
@@ -129,18 +121,18 @@ def test_gradient_by_the_search_vector_is_the_defined_point_gradient_chain_ruled
     np.testing.assert_allclose(leaf.grad[0], expected, rtol=1e-6, atol=1e-8)
 
 
-def point_gradients_by_hand(cost, sphere, points, vector, free_term):  # type: ignore[no-untyped-def]
+def point_gradients_by_hand(cost, sphere, points, vector, free_term):
     """How the points that the cost looks at move, and dC/d(moved point) as the paper defines it."""
     interior = cost._inside.numpy() if free_term == "interior" else np.zeros((0, 3))
     free = points.free if free_term == "direct" else np.zeros((0, 3))
     world = np.concatenate([free, points.occupied, points.known])
 
-    def moved(x: np.ndarray) -> np.ndarray:
+    def moved(x):
         rotation, translation = (part[0].numpy() for part in decode(SE3Space(), torch.tensor(x)))
         to_world = (interior - translation) @ rotation  # R^T (m - t)
         return np.concatenate([world @ rotation.T + translation, to_world])
 
-    def read(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def read(at):
         return sphere.at(at)
 
     at = moved(vector)
@@ -160,7 +152,7 @@ def point_gradients_by_hand(cost, sphere, points, vector, free_term):  # type: i
     return moved, np.concatenate(gradients)
 
 
-def test_interior_term_counts_interior_points_in_free_voxels(sphere: SdfGrid) -> None:
+def test_interior_term_counts_interior_points_in_free_voxels(sphere):
     """A half space of free voxels over half of the ball: half of sum -s over its deep nodes."""
     axis = np.arange(-12, 13) * 0.01
     free = np.stack(np.meshgrid(axis[axis > 0], axis, axis, indexing="ij"), -1).reshape(-1, 3)
@@ -172,7 +164,7 @@ def test_interior_term_counts_interior_points_in_free_voxels(sphere: SdfGrid) ->
     assert cost.evaluate(np.eye(4)[None])[0] == pytest.approx(20 * -s[deep].sum(), rel=1e-9)
 
 
-def test_volume_normalise_weighs_interior_points_by_their_voxel_share(sphere: SdfGrid) -> None:
+def test_volume_normalise_weighs_interior_points_by_their_voxel_share(sphere):
     points = KnownPoints(free=[[0.0, 0.0, 0.0]])
     plain, normal = (
         RelaxedCost(
@@ -188,7 +180,7 @@ def test_volume_normalise_weighs_interior_points_by_their_voxel_share(sphere: Sd
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 200), poses=st.integers(1, 7))
-def test_free_term_leaves_no_violated_point_out(seed: int, count: int, poses: int) -> None:
+def test_free_term_leaves_no_violated_point_out(seed, count, poses):
     stream = np.random.default_rng(seed)
     grid = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.06, 0.04)), 0.01)
     transforms = random_poses(stream, poses, 0.05)
@@ -206,7 +198,7 @@ def test_free_term_leaves_no_violated_point_out(seed: int, count: int, poses: in
         np.testing.assert_allclose(cost.evaluate(transforms), expected, rtol=1e-9, atol=1e-12)
 
 
-def test_a_pose_costs_the_same_alone_and_in_any_batch(sphere: SdfGrid) -> None:
+def test_a_pose_costs_the_same_alone_and_in_any_batch(sphere):
     stream = np.random.default_rng(1)
     transforms = random_poses(stream, 9, 0.1)
     points = KnownPoints(

@@ -1,10 +1,7 @@
 """Compiled code may use only operations whose result IEEE 754 fixes, in an order that we fix."""
 
-from __future__ import annotations
-
 import ast
 import re
-from pathlib import Path
 
 import pytest
 
@@ -27,24 +24,24 @@ COMPILED = {"compiled", "inner", "leaf", "spliced"}
 class Findings(ast.NodeVisitor):
     """Collects what a source file calls that it must not, as "line: what"."""
 
-    def __init__(self, everywhere: bool) -> None:
+    def __init__(self, everywhere):
         self._everywhere = everywhere
-        self.found: list[str] = []
-        self._modules: dict[str, str] = {}
-        self._integers: set[str] = set()
+        self.found = []
+        self._modules = {}
+        self._integers = set()
         self._compiled = False
 
-    def visit_Module(self, node: ast.Module) -> None:
+    def visit_Module(self, node):
         """Constants of the module that are integers stand for them."""
         for line in node.body:
             if isinstance(line, ast.Assign) and _is_integer(line.value):
                 self._integers |= {name.id for name in line.targets if isinstance(name, ast.Name)}
         self.generic_visit(node)
 
-    def _add(self, node: ast.expr | ast.stmt, what: str) -> None:
+    def _add(self, node, what):
         self.found.append(f"{node.lineno}: {what}")
 
-    def _check(self, node: ast.expr | ast.stmt, module: str, name: str) -> None:
+    def _check(self, node, module, name):
         package, first = module.split(".")[0], [*module.split("."), name][1]
         in_math = package == "math" and name not in ALLOWED_IN_MATH
         in_numpy = package == "numpy" and FORBIDDEN_IN_NUMPY.fullmatch(first)
@@ -52,29 +49,29 @@ class Findings(ast.NodeVisitor):
         if in_math or in_numpy or package == "cmath":
             self._add(node, f"{module}.{name}")
 
-    def visit_Import(self, node: ast.Import) -> None:
+    def visit_Import(self, node):
         for alias in node.names:
             self._modules[alias.asname or alias.name.split(".")[0]] = (
                 alias.name if alias.asname else alias.name.split(".")[0]
             )
 
-    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
+    def visit_ImportFrom(self, node):
         for alias in node.names:
             self._check(node, node.module or "", alias.name)
 
-    def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
+    def visit_FunctionDef(self, node):
         names = [ast.unparse(decorator) for decorator in node.decorator_list]
         outer, self._compiled = self._compiled, bool(COMPILED.intersection(names))
         self.generic_visit(node)
         self._compiled = outer
 
-    def visit_Attribute(self, node: ast.Attribute) -> None:
+    def visit_Attribute(self, node):
         module = self._modules.get(node.value.id) if isinstance(node.value, ast.Name) else None
         if module is not None:
             self._check(node, module, node.attr)
         self.generic_visit(node)
 
-    def visit_Call(self, node: ast.Call) -> None:
+    def visit_Call(self, node):
         name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
         of_module = isinstance(node.func, ast.Attribute) and isinstance(node.func.value, ast.Name)
         of_module = of_module and node.func.value.id in self._modules
@@ -82,19 +79,17 @@ class Findings(ast.NodeVisitor):
             self._add(node, f".{name}()")
         self.generic_visit(node)
 
-    def visit_Name(self, node: ast.Name) -> None:
+    def visit_Name(self, node):
         if node.id == "pow" or (self._compiled and node.id == "sum"):
             self._add(node, node.id)
 
-    def visit_BinOp(self, node: ast.BinOp) -> None:
+    def visit_BinOp(self, node):
         self._check_operator(node, node.op, node.right)
 
-    def visit_AugAssign(self, node: ast.AugAssign) -> None:
+    def visit_AugAssign(self, node):
         self._check_operator(node, node.op, node.value)
 
-    def _check_operator(
-        self, node: ast.BinOp | ast.AugAssign, operator: ast.operator, right: ast.expr
-    ) -> None:
+    def _check_operator(self, node, operator, right):
         if isinstance(operator, ast.MatMult):
             self._add(node, "@")
         named = isinstance(right, ast.Name) and right.id in self._integers
@@ -102,7 +97,7 @@ class Findings(ast.NodeVisitor):
             self._add(node, f"** {ast.unparse(right)}")
         self.generic_visit(node)
 
-    def visit_keyword(self, node: ast.keyword) -> None:
+    def visit_keyword(self, node):
         value = node.value
         off = isinstance(value, ast.Constant) and not value.value
         if node.arg in FORBIDDEN_OPTIONS and not off:
@@ -110,13 +105,13 @@ class Findings(ast.NodeVisitor):
         self.generic_visit(node)
 
 
-def _is_integer(exponent: ast.expr) -> bool:
+def _is_integer(exponent):
     if isinstance(exponent, ast.UnaryOp) and isinstance(exponent.op, ast.USub):
         exponent = exponent.operand
     return isinstance(exponent, ast.Constant) and type(exponent.value) is int
 
 
-def findings(source: str, *, everywhere: bool = True) -> list[str]:
+def findings(source, *, everywhere=True):
     """What a file uses; of numpy's functions, those inside of kernels alone if not everywhere."""
     visitor = Findings(everywhere)
     visitor.visit(ast.parse(source))
@@ -124,12 +119,12 @@ def findings(source: str, *, everywhere: bool = True) -> list[str]:
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=[path.name for path in SOURCES])
-def test_kernels_use_allowed_arithmetic_alone(path: Path) -> None:
+def test_kernels_use_allowed_arithmetic_alone(path):
     kernels_alone = path.parent.name == "numerics" or path.stem.endswith("_kernels")
     assert findings(path.read_text(), everywhere=kernels_alone) == []
 
 
-def test_beside_python_code_kernels_alone_are_searched() -> None:
+def test_beside_python_code_kernels_alone_are_searched():
     outside = "import numpy as np\ndef f(x):\n    return np.cumsum(x)\n"
     assert findings(outside) == ["3: numpy.cumsum"]
     assert findings(outside, everywhere=False) == []
@@ -165,7 +160,7 @@ def test_beside_python_code_kernels_alone_are_searched() -> None:
         "return inner_compiled(x, fastmath=True)",
     ],
 )
-def test_what_is_not_allowed_is_found(line: str) -> None:
+def test_what_is_not_allowed_is_found(line):
     source = f"import math\nimport math as m\nimport numpy as np\n{FUNCTION}{line}\n"
     assert len(findings(source)) == 1
 
@@ -181,6 +176,6 @@ def test_what_is_not_allowed_is_found(line: str) -> None:
         "return np.empty(3)",
     ],
 )
-def test_what_is_allowed_is_not_found(line: str) -> None:
+def test_what_is_allowed_is_not_found(line):
     source = f"import math\nimport math as m\nimport numpy as np\n{FUNCTION}{line}\n"
     assert findings(source) == []

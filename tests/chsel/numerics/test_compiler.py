@@ -1,15 +1,11 @@
 """Kernels are kept on disk; none that was compiled from other code, or by others, ever runs."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -54,7 +50,7 @@ print(near(1.0), sum(near.stats.cache_misses.values()))
 """
 
 
-def start(code: str, *words: str, root: Path = ROOT, **changes: str) -> subprocess.Popen[str]:
+def start(code, *words, root=ROOT, **changes):
     environment = {**os.environ, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1", **changes}
     return subprocess.Popen(
         [sys.executable, "-c", code, *words],
@@ -66,21 +62,19 @@ def start(code: str, *words: str, root: Path = ROOT, **changes: str) -> subproce
     )
 
 
-def result_of(process: subprocess.Popen[str]) -> tuple[str, str]:
+def result_of(process):
     """What the process printed, and what on stderr."""
     out, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
     return out, errors
 
 
-def test_a_kernel_is_compiled_again_if_anything_that_it_contains_has_changed(
-    tmp_path: Path,
-) -> None:
+def test_a_kernel_is_compiled_again_if_anything_that_it_contains_has_changed(tmp_path):
     shutil.copytree(ROOT / "chsel", tmp_path / "chsel", ignore=shutil.ignore_patterns("__py*"))
     for name, text in PLANTED.items():
         (tmp_path / "chsel" / name).write_text(text)
 
-    def near(code: str, *words: str) -> list[float]:
+    def near(code, *words):
         process = start(code, *words, root=tmp_path, CHSEL_CACHE_DIR=str(tmp_path / "kept"))
         return [float(word) for word in result_of(process)[0].split()]
 
@@ -97,7 +91,7 @@ def test_a_kernel_is_compiled_again_if_anything_that_it_contains_has_changed(
     assert near(NEAR) == [0.0, 0.0]
 
 
-def test_two_processes_compile_at_once_and_a_third_nothing(tmp_path: Path) -> None:
+def test_two_processes_compile_at_once_and_a_third_nothing(tmp_path):
     folder = tmp_path / "kept"
     names = {"CHSEL_CACHE_DIR": str(folder), "OMP_NUM_THREADS": "1"}
     processes = [start(COMPUTE, **names) for _ in range(2)]
@@ -113,7 +107,7 @@ def test_two_processes_compile_at_once_and_a_third_nothing(tmp_path: Path) -> No
     assert {each.stat().st_mode & 0o777 for each in (folder, *folder.iterdir())} == {0o700}
 
 
-def test_code_is_kept_apart_for_each_option_of_the_compiler() -> None:
+def test_code_is_kept_apart_for_each_option_of_the_compiler():
     show = "from chsel.numerics.compiler import cache_directory; print(cache_directory())"
     options = {"NUMBA_OPT": "0"}, {"NUMBA_OPT": "3"}, {"NUMBA_BOUNDSCHECK": "1"}
     folders = {result_of(start(show, **option))[0] for option in options}
@@ -121,11 +115,11 @@ def test_code_is_kept_apart_for_each_option_of_the_compiler() -> None:
 
 
 @pytest.fixture
-def kept_in(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
+def kept_in(monkeypatch):
     """Names the folder of compiled kernels for this test."""
     directory = compiler.cache_directory.__wrapped__
 
-    def name(folder: Path) -> None:
+    def name(folder):
         monkeypatch.setenv("CHSEL_CACHE_DIR", str(folder))
         monkeypatch.setattr(compiler, "cache_directory", directory)
 
@@ -133,9 +127,7 @@ def kept_in(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no such permissions on Windows")
-def test_a_folder_that_others_can_write_to_is_refused(
-    tmp_path: Path, kept_in: Callable[[Path], None]
-) -> None:
+def test_a_folder_that_others_can_write_to_is_refused(tmp_path, kept_in):
     named = tmp_path / "open" / "named"
     named.mkdir(parents=True, mode=0o700)
     kept_in(named)
@@ -159,7 +151,7 @@ def test_a_folder_that_others_can_write_to_is_refused(
         compiler.cache_directory()
 
 
-def test_a_command_with_such_a_folder_is_one_line_of_error(tmp_path: Path) -> None:
+def test_a_command_with_such_a_folder_is_one_line_of_error(tmp_path):
     tmp_path.chmod(0o777)
     command = [sys.executable, "-m", "runners.probe", "object=mustard", f"logs={tmp_path}"]
     environment = {**os.environ, "CHSEL_CACHE_DIR": str(tmp_path)}
@@ -170,9 +162,7 @@ def test_a_command_with_such_a_folder_is_one_line_of_error(tmp_path: Path) -> No
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a file cannot stand in for the folder there")
-def test_without_a_home_that_can_be_written_kernels_go_to_a_temporary_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_home_that_can_be_written_kernels_go_to_a_temporary_folder(tmp_path, monkeypatch):
     """A file in place of the home folder: as root, permissions would not hold anybody back."""
     monkeypatch.delenv("CHSEL_CACHE_DIR", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
@@ -184,7 +174,7 @@ def test_without_a_home_that_can_be_written_kernels_go_to_a_temporary_folder(
     assert wrapped().parent == tmp_path / f"chsel-{os.getuid()}"
 
 
-def test_folders_that_were_not_used_for_longest_are_removed(tmp_path: Path) -> None:
+def test_folders_that_were_not_used_for_longest_are_removed(tmp_path):
     folders = [tmp_path / f"{number:020x}" for number in range(11)]
     for age, folder in enumerate(folders):
         folder.mkdir()
@@ -200,13 +190,13 @@ class _Model(tuple[float]):
     """Of a package that the digest of the code is not of."""
 
 
-def test_functions_of_other_packages_are_not_kept() -> None:
-    kernel: Any = compiled(_twice)
+def test_functions_of_other_packages_are_not_kept():
+    kernel = compiled(_twice)
     assert kernel(2.0) == 4.0
     assert kernel.stats.cache_path is None
     with pytest.raises(TypeError, match=r"test_compiler\._twice is not in chsel; accepted: func"):
         implements(_twice, _Model)(_twice)
 
 
-def _twice(x: float) -> float:
+def _twice(x):
     return 2.0 * x

@@ -1,18 +1,14 @@
-from __future__ import annotations
-
 import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import mpmath
 import numpy as np
 import pytest
 
-from chsel.numerics.arrays import FloatArray, digest
+from chsel.numerics.arrays import digest
 from chsel.numerics.elementary import (
     arctangent,
     arctangents,
@@ -31,17 +27,17 @@ DIGEST = "c92dc86719aee4727a5d05c3d4e28b05"
 
 
 @pytest.fixture(autouse=True)
-def _many_digits():  # type: ignore[no-untyped-def]
+def _many_digits():
     with mpmath.workprec(250):
         yield
 
 
-def error(found: float, exact: mpmath.mpf) -> float:
+def error(found, exact):
     """In units of the last place of the exact value, whose sign counts where it is 0."""
     return float(abs((mpmath.mpf(float(found)) - exact) / math.ulp(float(exact))))
 
 
-def scattered(low: float, high: float, seed: int) -> FloatArray:
+def scattered(low, high, seed):
     """Numbers of both signs, their sizes spread evenly over the powers of two in between."""
     stream = np.random.Generator(np.random.Philox(seed))
     sizes = np.ldexp(
@@ -50,11 +46,11 @@ def scattered(low: float, high: float, seed: int) -> FloatArray:
     return sizes * np.where(stream.random(COUNT) < 0.5, -1.0, 1.0)
 
 
-def even(low: float, high: float, seed: int) -> FloatArray:
+def even(low, high, seed):
     return np.random.Generator(np.random.Philox(seed)).uniform(low, high, COUNT)
 
 
-def near_quarter_turns() -> FloatArray:
+def near_quarter_turns():
     """The doubles around multiples of pi/2, where the reduced argument is all cancellation."""
     turns = np.unique(np.floor(np.abs(scattered(0, 19, 1))))
     with mpmath.workprec(250):
@@ -62,11 +58,11 @@ def near_quarter_turns() -> FloatArray:
     return np.concatenate([nearest, np.nextafter(nearest, 0), -np.nextafter(nearest, np.inf)])
 
 
-def sine(x: float) -> float:
+def sine(x):
     return sine_cosine(x)[0]
 
 
-def cosine(x: float) -> float:
+def cosine(x):
     return sine_cosine(x)[1]
 
 
@@ -78,7 +74,7 @@ ANGLES = {
     "quarter turns": near_quarter_turns(),
 }
 SEAMS = 1.0 + scattered(-52, -8, 11)  # of the table of arctangents
-FUNCTIONS: list[tuple[Any, Any, dict[str, Any]]] = [
+FUNCTIONS = [
     (
         exp,
         mpmath.exp,
@@ -124,7 +120,7 @@ FUNCTIONS: list[tuple[Any, Any, dict[str, Any]]] = [
         for name, given in sets.items()
     ],
 )
-def test_a_function_is_within_an_ulp(function: Any, exact: Any, arguments: Any) -> None:
+def test_a_function_is_within_an_ulp(function, exact, arguments):
     for values in np.atleast_2d(arguments).T.tolist():
         assert error(function(*values), exact(*values)) < LIMIT, values
 
@@ -148,11 +144,11 @@ def test_a_function_is_within_an_ulp(function: Any, exact: Any, arguments: Any) 
         (log, math.inf, math.inf),
     ],
 )
-def test_values_at_the_ends_are_those_of_ieee_754(function: Any, x: float, value: float) -> None:
+def test_values_at_the_ends_are_those_of_ieee_754(function, x, value):
     assert function(x) == value
 
 
-def test_what_has_no_value_is_nan() -> None:
+def test_what_has_no_value_is_nan():
     assert math.isnan(exp(math.nan))
     assert all(math.isnan(log(x)) for x in (math.nan, -1.0, -5e-324, -math.inf))
     assert all(math.isnan(v) for x in (math.nan, math.inf, -math.inf) for v in sine_cosine(x))
@@ -160,14 +156,14 @@ def test_what_has_no_value_is_nan() -> None:
     assert math.isnan(arctangent(0.0, math.nan))
 
 
-def test_sine_keeps_the_sign_of_zero_and_the_smallest_numbers() -> None:
+def test_sine_keeps_the_sign_of_zero_and_the_smallest_numbers():
     for x in (0.0, -0.0, 5e-324, -5e-324, 1e-300, -1e-9):
         found = sine(x)
         assert (found, math.copysign(1.0, found), cosine(x)) == (x, math.copysign(1.0, x), 1.0)
 
 
 @pytest.mark.parametrize("x", [2.0**20, -1234567.8, 1e9, -3e15, 1e100, 1.7976931348623157e308])
-def test_beyond_2_to_the_20_an_angle_is_taken_modulo_the_double_next_to_a_turn(x: float) -> None:
+def test_beyond_2_to_the_20_an_angle_is_taken_modulo_the_double_next_to_a_turn(x):
     left = math.fmod(x, 2.0 * math.pi)
     assert abs(sine(x) - mpmath.sin(left)) < 1.2e-16
     assert abs(cosine(x) - mpmath.cos(left)) < 1.2e-16
@@ -175,7 +171,7 @@ def test_beyond_2_to_the_20_an_angle_is_taken_modulo_the_double_next_to_a_turn(x
         assert abs(sine(x) - mpmath.sin(x)) < 4e-17 * abs(x) + 1.2e-16
 
 
-def test_zeros_and_infinities_of_the_arctangent_are_those_of_c() -> None:
+def test_zeros_and_infinities_of_the_arctangent_are_those_of_c():
     values = [0.0, 5e-324, 1.0, 1e308, math.inf]
     values += [-v for v in values]
     for y in values:
@@ -196,9 +192,7 @@ def test_zeros_and_infinities_of_the_arctangent_are_those_of_c() -> None:
     ],
     ids=["exps", "logs", "sines", "cosines", "arctangents"],
 )
-def test_arrays_keep_their_shape_and_hold_the_scalars(
-    arrays: Callable[[FloatArray | float], FloatArray], scalar: Callable[[float], float]
-) -> None:
+def test_arrays_keep_their_shape_and_hold_the_scalars(arrays, scalar):
     values = np.abs(scattered(-3, 3, 1))[:24].reshape(2, 3, 4)
     for x in (values, values.transpose(2, 0, 1), values[:, ::2, 1:], values[:0], values[0, 0, 0]):
         expected = [scalar(v) for v in np.ravel(x).tolist()]
@@ -208,12 +202,12 @@ def test_arrays_keep_their_shape_and_hold_the_scalars(
     assert arrays(2) == scalar(2.0)
 
 
-def test_arctangents_of_different_shapes_are_broadcast() -> None:
+def test_arctangents_of_different_shapes_are_broadcast():
     found = arctangents(np.array([[1.0], [-1.0]]), np.array([1.0, -1.0, 0.0]))
     np.testing.assert_allclose(found, np.pi / 4 * np.array([[1, 3, 2], [-1, -3, -2]]), rtol=1e-15)
 
 
-def sample() -> str:
+def sample():
     """Digest of all functions at arguments that no rounding hangs on."""
     u = np.random.Generator(np.random.Philox(7)).random((4, 5000)) - 0.5
     return digest(
@@ -225,11 +219,11 @@ def sample() -> str:
     )
 
 
-def test_the_bits_are_those_of_every_other_machine() -> None:
+def test_the_bits_are_those_of_every_other_machine():
     assert sample() == DIGEST
 
 
-def test_code_for_the_oldest_cpu_gives_the_same_bits(tmp_path: Path) -> None:
+def test_code_for_the_oldest_cpu_gives_the_same_bits(tmp_path):
     code = (
         "import runpy, sys; import chsel.numerics.elementary;"
         "print(runpy.run_path(sys.argv[1])['sample']())"

@@ -1,15 +1,11 @@
 """Work shared out to threads: each piece once, errors reach the caller, IEEE arithmetic."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import platform
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,23 +27,23 @@ NEAREST = 0
 
 
 @pytest.fixture(autouse=True)
-def no_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_setting(monkeypatch):
     """No number of threads is set, as a command that ran in this process may have done."""
     monkeypatch.setattr(numerics_threads._setting, "count", None)
 
 
-def no_scratch() -> None:
+def no_scratch():
     return None
 
 
 @pytest.mark.parametrize("least", [1, 3])
 @pytest.mark.parametrize("multiple", [1, 8])
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 7, 8, 9, 100, 1001])
-def test_pieces_cover_the_range_once(threads: int, count: int, multiple: int, least: int) -> None:
-    done: list[int] = []
-    starts: list[int] = []
+def test_pieces_cover_the_range_once(threads, count, multiple, least):
+    done = []
+    starts = []
 
-    def run(first: int, last: int, _: Any) -> None:
+    def run(first, last, _):
         starts.append(first)
         done.extend(range(first, last))
 
@@ -57,7 +53,7 @@ def test_pieces_cover_the_range_once(threads: int, count: int, multiple: int, le
 
 
 @pytest.mark.parametrize("count", [0, -1, 257, 10_000, 1.0, True])
-def test_a_number_of_threads_that_cannot_be_meant_is_refused(count: Any) -> None:
+def test_a_number_of_threads_that_cannot_be_meant_is_refused(count):
     with (
         pytest.raises(SettingError, match=rf"threads is {count}; accepted: .* from 1 to 256"),
         use_threads(count),
@@ -82,33 +78,33 @@ print(*seen, thread_count())
 """
 
 
-def test_the_number_of_threads_is_what_was_set_or_that_of_torch_or_openmp() -> None:
+def test_the_number_of_threads_is_what_was_set_or_that_of_torch_or_openmp():
     command = [sys.executable, "-c", SETTINGS]
     environment = {**os.environ, "OMP_NUM_THREADS": "3,1"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert (done.stdout, done.stderr) == ("3 2 3 4 6\n", "")
 
 
-def test_every_thread_works_in_scratch_of_its_own(threads: int) -> None:
+def test_every_thread_works_in_scratch_of_its_own(threads):
     """No thread goes on before all have begun."""
     begun = threading.Barrier(threads)
-    used: dict[int, set[int]] = {}
+    used = {}
 
-    def run(first: int, last: int, own: object) -> None:
+    def run(first, last, own):
         if threading.get_ident() not in used:
             used[threading.get_ident()] = set()
             begun.wait()
         used[threading.get_ident()].add(id(own))
 
-    kept: list[object] = []
+    kept = []
     parallel_for(run, 200, lambda: kept.append(object()) or kept[-1])
     assert len(used) == threads
     assert all(len(own) == 1 for own in used.values())
     assert len(set.union(*used.values())) == threads
 
 
-def test_an_error_in_a_piece_reaches_the_caller(threads: int) -> None:
-    def run(first: int, last: int, _: Any) -> None:
+def test_an_error_in_a_piece_reaches_the_caller(threads):
+    def run(first, last, _):
         if first <= 57 < last:
             raise ValueError("piece with 57")
 
@@ -116,13 +112,13 @@ def test_an_error_in_a_piece_reaches_the_caller(threads: int) -> None:
         parallel_for(run, 100, no_scratch)
 
 
-def test_work_may_spread_work(threads: int) -> None:
+def test_work_may_spread_work(threads):
     parts = np.zeros((12, 20))
 
-    def outer(first: int, last: int, _: Any) -> None:
+    def outer(first, last, _):
         for n in range(first, last):
 
-            def inner(start: int, stop: int, _: Any, n: int = n) -> None:
+            def inner(start, stop, _, n=n):
                 parts[n, start:stop] += n + np.arange(start, stop)
 
             parallel_for(inner, 20, no_scratch)
@@ -132,7 +128,7 @@ def test_work_may_spread_work(threads: int) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="threads inherit their rounding on Linux")
-def test_arithmetic_that_flushes_subnormals_is_refused(threads: int) -> None:
+def test_arithmetic_that_flushes_subnormals_is_refused(threads):
     """A thread starts with the rounding of the thread that starts it."""
     if not torch.set_flush_denormal(True):
         pytest.skip("this processor cannot flush subnormal numbers")
@@ -146,7 +142,7 @@ def test_arithmetic_that_flushes_subnormals_is_refused(threads: int) -> None:
         torch.set_flush_denormal(False)
 
 
-def register() -> None:
+def register():
     points = {"surface": np.array([[0.025, 0.0, 0.0]]), "free": np.array([[0.1, 0.0, 0.0]])}
     settings = {"descent": {"restarts": 1, "iterations": 1}, "emitter": {"iterations": 1}}
     chsel.register(ball_grid(0.025, 0.01, 4), **points, method="chsel", settings=settings)
@@ -155,7 +151,7 @@ def register() -> None:
 @pytest.mark.skipif(not MODES or platform.system() != "Linux", reason="fesetround's values differ")
 @pytest.mark.parametrize("act", [require_ieee_arithmetic, register])
 @pytest.mark.parametrize("mode", ["down", "up", "towards zero"])
-def test_nothing_runs_with_another_rounding(mode: str, act: Callable[[], None]) -> None:
+def test_nothing_runs_with_another_rounding(mode, act):
     act()
     library = ctypes.CDLL(None)
     assert library.fesetround(MODES[mode]) == 0

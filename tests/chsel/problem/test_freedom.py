@@ -1,13 +1,10 @@
 """Whether the best hypothesis can be moved without its points becoming unlikely."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
 
 import chsel
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.noise import noise_model
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import RegistrationProblem
@@ -24,37 +21,35 @@ BEST = Poses.of(inverse(POSE[None]))
 SIGMA, DISTANCE = 0.001, 0.006
 
 
-def touched(mesh: trimesh.Trimesh, **points: FloatArray) -> RegistrationProblem:
+def touched(mesh, **points):
     """By points in the object's frame."""
     known = chsel.KnownPoints(**{name: apply(POSE, group) for name, group in points.items()})
     sdf, room = chsel.SdfGrid.from_mesh(mesh, 0.004), chsel.Workspace((-1, -1, -1), (1, 1, 1))
     return RegistrationProblem(sdf, known, BEST.matrices, room, 0.01, StreamKey(0, 0))
 
 
-def movable(mesh: trimesh.Trimesh, sigma: float = SIGMA, **points: FloatArray) -> bool:
+def movable(mesh, sigma=SIGMA, **points):
     return can_be_moved(touched(mesh, **points), BEST, sigma, DISTANCE)
 
 
-def on(mesh: trimesh.Trimesh, count: int) -> FloatArray:
+def on(mesh, count):
     return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
 
 
-def on_sides() -> FloatArray:
+def on_sides():
     """Contacts on the four long sides of the box, not near its ends."""
     points = on(BOX, 80)
     return points[np.abs(points[:, 2]) < 0.06]
 
 
 @pytest.mark.parametrize("mesh", [BOX, CAN])
-def test_contacts_all_around_hold_an_object_and_a_turn_of_a_can_is_no_motion(
-    mesh: trimesh.Trimesh,
-) -> None:
+def test_contacts_all_around_hold_an_object_and_a_turn_of_a_can_is_no_motion(mesh):
     assert not movable(mesh, known=on(mesh, 40))
     assert movable(mesh, known=on(mesh, 4))
     assert movable(mesh, sigma=0.03, known=on(mesh, 40))  # far more than the distance
 
 
-def test_an_object_slides_along_the_sides_that_were_touched() -> None:
+def test_an_object_slides_along_the_sides_that_were_touched():
     """By 14 mm, which moves the two ends by it and all else within itself: 6 mm on average."""
     sides = on_sides()
     assert movable(BOX, known=sides)
@@ -62,7 +57,7 @@ def test_an_object_slides_along_the_sides_that_were_touched() -> None:
     assert not movable(BOX, known=np.concatenate([sides, ends]))
 
 
-def test_free_space_holds_an_object_too() -> None:
+def test_free_space_holds_an_object_too():
     sides = on_sides()
     x, y = np.meshgrid(np.arange(-0.05, 0.051, 0.01), np.arange(-0.03, 0.031, 0.01))
     beyond = np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.083)], axis=1)
@@ -70,12 +65,12 @@ def test_free_space_holds_an_object_too() -> None:
     assert not movable(BOX, known=sides, free=np.concatenate([beyond, -beyond]))
 
 
-def test_nothing_known_nearby_holds_nothing() -> None:
+def test_nothing_known_nearby_holds_nothing():
     assert movable(BOX, free=np.full((3, 3), 0.5))
 
 
 @pytest.mark.parametrize("contacts", [5, 40])
-def test_energies_of_poses_are_the_plain_formula(contacts: int) -> None:
+def test_energies_of_poses_are_the_plain_formula(contacts):
     random = np.random.default_rng(contacts)
     problem = touched(
         BOX,

@@ -1,7 +1,5 @@
 """Meshes are merged and checked at the border."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np
@@ -15,7 +13,7 @@ EXTENTS = (0.1, 0.2, 0.3)
 
 
 @pytest.fixture
-def box() -> trimesh.Trimesh:
+def box():
     return trimesh.creation.box(EXTENTS)
 
 
@@ -50,7 +48,7 @@ def test_a_scene_becomes_one_mesh_with_its_parts_in_place(box, tmp_path):
     assert mesh.volume == pytest.approx(0.012, rel=1e-6)
 
 
-def moved(mesh: trimesh.Trimesh, *offset: float) -> trimesh.Trimesh:
+def moved(mesh, *offset):
     return mesh.copy().apply_translation(offset)
 
 

@@ -1,7 +1,5 @@
 """What points are off: estimated at the best pose, and the likelihood of poses by it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -22,9 +20,7 @@ SENSOR = 0.0005
 
 @pytest.mark.parametrize("sigma", [0.001, 0.006])
 @pytest.mark.parametrize("foreign", [0, 60])
-def test_many_distances_tell_the_noise_and_the_share_of_outliers(
-    sigma: float, foreign: int
-) -> None:
+def test_many_distances_tell_the_noise_and_the_share_of_outliers(sigma, foreign):
     random = np.random.default_rng(3)
     distances = np.concatenate([random.normal(0.0, sigma, 600), random.uniform(0.05, 0.2, foreign)])
     noise = estimate_noise(random.permutation(distances), SENSOR)
@@ -33,31 +29,31 @@ def test_many_distances_tell_the_noise_and_the_share_of_outliers(
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 6])
-def test_few_distances_that_a_fit_makes_small_leave_the_noise_of_the_sensor(count: int) -> None:
+def test_few_distances_that_a_fit_makes_small_leave_the_noise_of_the_sensor(count):
     noise = estimate_noise(np.full(count, 1e-5), SENSOR)
     assert noise.sigma == pytest.approx(SENSOR, rel=1e-3)
     expected = PRIOR_CONTACTS * PRIOR_OUTLIERS / (PRIOR_CONTACTS + count)
     assert noise.outliers == pytest.approx(expected)
 
 
-def test_it_is_never_less_than_the_sensor_s() -> None:
+def test_it_is_never_less_than_the_sensor_s():
     assert estimate_noise(np.full(100, 1e-6), SENSOR).sigma == SENSOR
 
 
-def test_one_contact_far_off_among_five_is_an_outlier() -> None:
+def test_one_contact_far_off_among_five_is_an_outlier():
     distances = np.array([0.0003, -0.0004, 0.05, 0.0002, -0.0001])
     noise = estimate_noise(distances, SENSOR)
     assert noise.sigma < 2.0 * SENSOR
     assert noise.outliers == pytest.approx((1.0 + PRIOR_CONTACTS * PRIOR_OUTLIERS) / 9.0)
 
 
-def test_neither_order_nor_sign_matters() -> None:
+def test_neither_order_nor_sign_matters():
     distances = np.random.default_rng(1).normal(0.0, 0.003, 40)
     assert estimate_noise(distances, SENSOR) == estimate_noise(-distances[::-1], SENSOR)
 
 
 @pytest.mark.parametrize(("known", "shared"), [(0, 0.0), (3, 0.0), (12, 0.004), (50, 0.0)])
-def test_energies_are_the_formula(known: int, shared: float) -> None:
+def test_energies_are_the_formula(known, shared):
     """Of contacts, one of which is 30 cm off, and of 40 voxels: none, some or most are wrong."""
     random, noise = np.random.default_rng(known), noise_model(SENSOR, shared)
     residuals = random.normal(0.0, 0.004, (9, known))
@@ -67,7 +63,7 @@ def test_energies_are_the_formula(known: int, shared: float) -> None:
     np.testing.assert_allclose(noise.energies(residuals, depths), expected, rtol=1e-12, atol=1e-12)
 
 
-def test_levels_of_noise_are_those_of_the_sensor_and_of_all_else() -> None:
+def test_levels_of_noise_are_those_of_the_sensor_and_of_all_else():
     one, other = noise_model(0.0), noise_model(0.003)
     assert len(one.sigmas) == LEVELS
     assert sum(one.weights) == pytest.approx(1.0)
@@ -78,7 +74,7 @@ def test_levels_of_noise_are_those_of_the_sensor_and_of_all_else() -> None:
     assert one.sigmas[0] < 0.001 < 0.005 < one.sigmas[-1]
 
 
-def test_wrong_points_cost_a_bounded_amount_and_later_ones_less() -> None:
+def test_wrong_points_cost_a_bounded_amount_and_later_ones_less():
     noise, none = noise_model(SENSOR), np.zeros((5, 0))
     depths = np.zeros((5, 4))
     depths[1, 0], depths[2, 0], depths[3, :2], depths[4] = 0.05, 0.5, 0.5, 0.5
@@ -89,7 +85,7 @@ def test_wrong_points_cost_a_bounded_amount_and_later_ones_less() -> None:
     assert foreign[2] == pytest.approx(foreign[1], abs=0.01)
 
 
-def test_many_alike_points_count_as_few() -> None:
+def test_many_alike_points_count_as_few():
     noise, count = noise_model(SENSOR), int(INDEPENDENT)
     rows = np.random.default_rng(2).normal(0.0, 0.003, (4, count))
     once = noise.energies(rows, np.zeros((4, 0)))

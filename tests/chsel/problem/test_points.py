@@ -1,7 +1,5 @@
 """Known points, and those that cannot be, or hardly are, those of an object."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -10,7 +8,6 @@ import torch
 import trimesh
 
 from chsel.errors import PointsError
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import (
     FreeVoxels,
     GrowingPoints,
@@ -22,7 +19,7 @@ from chsel.problem.points import (
 )
 
 
-def test_points_are_copied_and_can_not_be_changed() -> None:
+def test_points_are_copied_and_can_not_be_changed():
     mine = np.zeros((2, 3))
     points = KnownPoints(free=mine)
     mine += 1.0
@@ -31,9 +28,9 @@ def test_points_are_copied_and_can_not_be_changed() -> None:
         points.free[0] = 1.0
 
 
-def test_tensors_lists_and_arrays_of_other_types_are_taken() -> None:
+def test_tensors_lists_and_arrays_of_other_types_are_taken():
     for given in ([[1, 2, 3]], torch.tensor([[1.0, 2.0, 3.0]]), np.array([[1, 2, 3]], np.int8)):
-        points = KnownPoints(known=given)  # type: ignore[arg-type]
+        points = KnownPoints(known=given)
         assert points.known.dtype == np.float64
         np.testing.assert_array_equal(points.known, [[1.0, 2.0, 3.0]])
         np.testing.assert_array_equal(points.sdf, [0.0])
@@ -49,12 +46,12 @@ def test_tensors_lists_and_arrays_of_other_types_are_taken() -> None:
         ({"free": np.zeros(3)}, r"free has shape \(3,\)"),
     ],
 )
-def test_malformed_points_are_named(arrays: dict[str, object], message: str) -> None:
+def test_malformed_points_are_named(arrays, message):
     with pytest.raises(PointsError, match=message):
-        KnownPoints(**arrays)  # type: ignore[arg-type]
+        KnownPoints(**arrays)
 
 
-def test_merging_appends_class_by_class_and_changes_the_digest() -> None:
+def test_merging_appends_class_by_class_and_changes_the_digest():
     first = KnownPoints(free=[[0, 0, 0]], known=[[1, 1, 1]], known_sdf=[0.1])
     second = KnownPoints(free=[[2, 2, 2]], occupied=[[3, 3, 3]], known=[[4, 4, 4]])
     both = first.merged(second)
@@ -65,7 +62,7 @@ def test_merging_appends_class_by_class_and_changes_the_digest() -> None:
     assert len({first.digest, second.digest, both.digest, second.merged(first).digest}) == 4
 
 
-def test_the_same_points_are_those_of_the_same_digest() -> None:
+def test_the_same_points_are_those_of_the_same_digest():
     arrays = ({"free": [[0, 1, 2]]}, {"free": [[-0.0, 1, 2]]}, {"known": [[0, 1, 2]]})
     points = [KnownPoints(**arrays[n]) for n in (0, 0, 1, 2)]
     for a, b in itertools.product(points, points):
@@ -76,7 +73,7 @@ def test_the_same_points_are_those_of_the_same_digest() -> None:
             assert growing.same(c.merged(d)) == (a.merged(b).digest == c.merged(d).digest)
 
 
-def test_voxels_keep_one_point_each_at_their_centres() -> None:
+def test_voxels_keep_one_point_each_at_their_centres():
     voxels = FreeVoxels(Lattice((0.1, 0.0, 0.0), 0.025))
     new = voxels.add(np.array([[0.101, 0.0, 0.0], [0.11, 0.001, 0.0], [0.15, -0.03, 0.0]]))
     np.testing.assert_allclose(new, [[0.1, 0.0, 0.0], [0.15, -0.025, 0.0]])
@@ -85,7 +82,7 @@ def test_voxels_keep_one_point_each_at_their_centres() -> None:
     assert len(voxels) == 2
 
 
-def test_workspace_must_have_an_inside() -> None:
+def test_workspace_must_have_an_inside():
     with pytest.raises(PointsError, match="lower bound below its upper"):
         Workspace((0, 0, 0), (1, 0, 1))
     around = Workspace.around(np.array([[0.0, 1.0, 2.0], [0.5, 1.0, 2.0]]), 0.1)
@@ -99,7 +96,7 @@ SURFACE = trimesh.sample.sample_surface(BOX, 200, seed=0)[0]
 ROOM = Workspace((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3))
 
 
-def lattice_of(lower: FloatArray, upper: FloatArray) -> FloatArray:
+def lattice_of(lower, upper):
     """The centres of all voxels between two corners, of a lattice that begins at ROOM."""
     axes = [np.arange(low, high, SIDE / 2) for low, high in zip(lower, upper, strict=True)]
     every = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -111,21 +108,21 @@ OUTSIDE_BOX = (np.abs(AROUND) > BOX.extents / 2).any(axis=1)
 GOOD = KnownPoints(free=AROUND[OUTSIDE_BOX], known=SURFACE)
 
 
-def codes(points: KnownPoints, workspace: Workspace | None = ROOM) -> list[str]:
+def codes(points, workspace=ROOM):
     return [warning.code for warning in check_points(points, DIAMETER, SIDE, workspace)]
 
 
-def text(points: KnownPoints, workspace: Workspace | None = ROOM) -> str:
+def text(points, workspace=ROOM):
     return "\n".join(map(str, check_points(points, DIAMETER, SIDE, workspace)))
 
 
-def test_all_space_around_an_object_and_points_all_over_it_are_fine() -> None:
+def test_all_space_around_an_object_and_points_all_over_it_are_fine():
     assert codes(GOOD) == []
     assert check_contacts(GOOD) == []
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.3])
-def test_points_in_millimetres_are_an_error(scale: float) -> None:
+def test_points_in_millimetres_are_an_error(scale):
     """Also contacts that are all on a small part of the object."""
     points = KnownPoints(known=1000.0 * scale * SURFACE)
     with pytest.raises(
@@ -137,7 +134,7 @@ def test_points_in_millimetres_are_an_error(scale: float) -> None:
         check_points(points, DIAMETER, SIDE)
 
 
-def test_contacts_ten_diameters_apart_are_a_warning() -> None:
+def test_contacts_ten_diameters_apart_are_a_warning():
     near = KnownPoints(known=[[0.0, 0.0, 0.0], [9.9 * DIAMETER, 0.0, 0.0]])
     assert codes(near, None) == []
     far = KnownPoints(known=[[0.0, 0.0, 0.0], [10.1 * DIAMETER, 0.0, 0.0]])
@@ -145,12 +142,12 @@ def test_contacts_ten_diameters_apart_are_a_warning() -> None:
     assert "span 2.31 m, and the object is 0.229 m" in text(far, None)
 
 
-def test_a_single_contact_far_away_is_an_outlier_and_no_error() -> None:
+def test_a_single_contact_far_away_is_an_outlier_and_no_error():
     stray = KnownPoints(known=np.concatenate([SURFACE, [[0.0, 500.0, 0.0]]]))
     assert codes(stray, None) == ["contacts_apart"]
 
 
-def test_contacts_far_from_all_free_points_are_a_warning() -> None:
+def test_contacts_far_from_all_free_points_are_a_warning():
     free = AROUND[:50]
     reach = float(np.linalg.norm(free, axis=1).min())
     away = np.array([[reach + 10.5 * DIAMETER, 0.0, 0.0]])
@@ -161,13 +158,13 @@ def test_contacts_far_from_all_free_points_are_a_warning() -> None:
     assert codes(KnownPoints(free=np.concatenate([free, away + 0.1]), known=away), None) == []
 
 
-def test_a_contact_between_two_far_regions_of_free_space_is_a_warning() -> None:
+def test_a_contact_between_two_far_regions_of_free_space_is_a_warning():
     free = np.array([[-3.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
     points = KnownPoints(free=free, known=[[0.0, 0.0, 0.0]])
     assert codes(points, None) == ["contacts_far_from_free"]
 
 
-def test_contacts_outside_of_the_workspace_are_counted() -> None:
+def test_contacts_outside_of_the_workspace_are_counted():
     moved = SURFACE + np.array([0.32, 0.0, 0.0])  # its ends are at 0.22 and 0.42, the room's at 0.3
     count = int((moved[:, 0] > 0.3 + 0.2 * DIAMETER).sum())
     assert 10 < count < 190
@@ -181,13 +178,13 @@ def test_contacts_outside_of_the_workspace_are_counted() -> None:
     assert codes(KnownPoints(known=by_4_cm)) == []
 
 
-def test_contacts_that_are_all_far_outside_of_the_workspace_are_an_error() -> None:
+def test_contacts_that_are_all_far_outside_of_the_workspace_are_an_error():
     away = KnownPoints(known=SURFACE + np.array([0.0, 0.7, 0.0]))
     with pytest.raises(PointsError, match=r"the nearest 0.35 m from it; accepted: a workspace"):
         check_points(away, DIAMETER, SIDE, ROOM)
 
 
-def test_contacts_deep_in_free_space_are_a_warning() -> None:
+def test_contacts_deep_in_free_space_are_a_warning():
     points = KnownPoints(free=AROUND, known=SURFACE)
     assert codes(points) == ["contacts_in_free_space"]
     assert "200 of 200 contacts are in free space" in text(points)
@@ -196,7 +193,7 @@ def test_contacts_deep_in_free_space_are_a_warning() -> None:
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_contact_with_any_unknown_voxel_beside_it_is_fine(axis: int) -> None:
+def test_a_contact_with_any_unknown_voxel_beside_it_is_fine(axis):
     contact = np.zeros((1, 3)) + 0.001
     beside = np.zeros(3)
     beside[axis] = SIDE
@@ -206,12 +203,12 @@ def test_a_contact_with_any_unknown_voxel_beside_it_is_fine(axis: int) -> None:
     assert codes(KnownPoints(free=AROUND, known=contact)) == ["contacts_in_free_space"]
 
 
-def test_the_same_points_as_contacts_and_as_free_are_a_warning() -> None:
+def test_the_same_points_as_contacts_and_as_free_are_a_warning():
     points = KnownPoints(free=np.concatenate([GOOD.free, SURFACE[:7]]), known=SURFACE)
     assert "7 of 200 contacts are in free space" in text(points)
 
 
-def test_free_points_alone_say_nothing_about_where_the_object_is() -> None:
+def test_free_points_alone_say_nothing_about_where_the_object_is():
     (warning,) = check_contacts(KnownPoints(free=AROUND))
     assert warning.code == "no_contact"
     for informative in (
@@ -221,7 +218,7 @@ def test_free_points_alone_say_nothing_about_where_the_object_is() -> None:
         assert check_contacts(informative) == []
 
 
-def test_fine_voxels_over_a_large_space_take_no_memory() -> None:
+def test_fine_voxels_over_a_large_space_take_no_memory():
     """Too many voxels to number them are not looked at."""
     points = KnownPoints(free=[[1.0, 0.0, 0.0]], known=[[0.0, 0.0, 0.0], [4.0, 4.0, 4.0]])
     assert check_points(points, 10.0, 1e-6) == []

@@ -1,7 +1,5 @@
 """Rigid transforms, and poses between poses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
@@ -19,7 +17,7 @@ from chsel.problem.poses import (
 )
 
 
-def test_transforms_that_are_not_rigid_are_named() -> None:
+def test_transforms_that_are_not_rigid_are_named():
     poses = np.tile(np.eye(4), (3, 1, 1))
     check_rigid("poses", poses)
     for row, column, value in ((0, 0, 1.1), (0, 0, -1.0), (3, 0, 0.5)):
@@ -31,14 +29,14 @@ def test_transforms_that_are_not_rigid_are_named() -> None:
     check_rigid("poses", nearest_rigid("poses", rounded))
 
 
-def test_quaternions_and_rotations_are_each_others_inverse() -> None:
+def test_quaternions_and_rotations_are_each_others_inverse():
     r = random_rotations(np.random.default_rng(0), 100)
     axes = np.eye(3)
     r = np.concatenate([r, np.eye(3)[None], axis_angle(axes, np.full(3, np.pi))])
     np.testing.assert_allclose(rotation_matrices(quaternions(r)), r, atol=1e-14)
 
 
-def test_turns_are_those_of_scipy_and_positions_on_a_line() -> None:
+def test_turns_are_those_of_scipy_and_positions_on_a_line():
     stream = np.random.default_rng(1)
     first, second = random_rotations(stream, 2)
     t = np.array([0.0, 0.1, 0.5, 0.9, 1.0])
@@ -51,7 +49,7 @@ def test_turns_are_those_of_scipy_and_positions_on_a_line() -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 1.0, 3.1, np.pi])
-def test_half_of_a_turn_is_half_its_angle(angle: float) -> None:
+def test_half_of_a_turn_is_half_its_angle(angle):
     start = compose(random_rotations(np.random.default_rng(2), 1), np.zeros((1, 3)))
     axis = np.array([0.6, 0.0, 0.8])
     turned, half = start.copy(), start.copy()

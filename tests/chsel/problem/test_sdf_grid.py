@@ -1,8 +1,4 @@
-from __future__ import annotations
-
 import re
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,20 +17,20 @@ SIZE = np.array([0.2, 0.12, 0.08])
 
 
 @pytest.fixture(scope="module")
-def box() -> trimesh.Trimesh:
+def box():
     return trimesh.creation.box(SIZE)
 
 
 @pytest.fixture(scope="module")
-def grid(box: trimesh.Trimesh) -> SdfGrid:
+def grid(box):
     return SdfGrid.from_mesh(box, 0.01)
 
 
-def box_sdf(points: np.ndarray) -> np.ndarray:
+def box_sdf(points):
     return box_distance(points, SIZE)
 
 
-def test_distance_to_a_box_has_its_closed_form(box: trimesh.Trimesh) -> None:
+def test_distance_to_a_box_has_its_closed_form(box):
     points = np.random.default_rng(0).uniform(-0.2, 0.2, (3000, 3))
     sdf, gradient = mesh_sdf(box, points)
     np.testing.assert_allclose(sdf, box_sdf(points), atol=1e-12)
@@ -44,7 +40,7 @@ def test_distance_to_a_box_has_its_closed_form(box: trimesh.Trimesh) -> None:
     np.testing.assert_allclose((ahead - sdf)[away], 1e-7, rtol=1e-3)
 
 
-def test_an_open_mesh_gets_its_sign_from_the_winding_number(box: trimesh.Trimesh) -> None:
+def test_an_open_mesh_gets_its_sign_from_the_winding_number(box):
     opened = trimesh.Trimesh(box.vertices, box.faces[:-1], process=False)
     assert not opened.is_watertight
     sdf, _ = mesh_sdf(opened, np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.0, 0.3]]))
@@ -57,7 +53,7 @@ SCANS += ("035_power_drill", "048_hammer", "050_medium_clamp")
 
 
 @pytest.mark.parametrize("name", SCANS)
-def test_the_sign_changes_nowhere_but_at_the_surface(ycb_directory: Path, name: str) -> None:
+def test_the_sign_changes_nowhere_but_at_the_surface(ycb_directory, name):
     """From a node further from the surface than the next node, no step leads through it.
 
     Pseudonormals fail this at the hammer's scan, which has a folded sliver.
@@ -74,18 +70,16 @@ def test_the_sign_changes_nowhere_but_at_the_surface(ycb_directory: Path, name: 
 
 
 @pytest.mark.parametrize("mesh", ["box.obj", None, trimesh.Scene(), trimesh.Trimesh()])
-def test_a_grid_of_no_mesh_is_refused(mesh: Any) -> None:
+def test_a_grid_of_no_mesh_is_refused(mesh):
     with pytest.raises(MeshError, match=r"mesh is .*; accepted: a Trimesh with faces"):
         SdfGrid.from_mesh(mesh)
 
 
-def test_a_grid_made_in_parts_has_the_same_bits_and_says_how_far_it_is(
-    box: trimesh.Trimesh, grid: SdfGrid, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    told: list[tuple[int, int]] = []
+def test_a_grid_made_in_parts_has_the_same_bits_and_says_how_far_it_is(box, grid, monkeypatch):
+    told = []
     nodes = grid.values.size
 
-    def remade(mesh: trimesh.Trimesh = box) -> SdfGrid:
+    def remade(mesh=box):
         told.clear()
         return SdfGrid.from_mesh(mesh, 0.01, progress=lambda *counts: told.append(counts))
 
@@ -110,9 +104,7 @@ def test_a_grid_made_in_parts_has_the_same_bits_and_says_how_far_it_is(
         ((0.18, 0.09, 0.015), 0.03),
     ],
 )
-def test_the_default_grid_of_a_thin_object_is_small_and_has_two_nodes_across(
-    size: tuple[float, float, float], tilt: float
-) -> None:
+def test_the_default_grid_of_a_thin_object_is_small_and_has_two_nodes_across(size, tilt):
     plate = trimesh.creation.box(size)
     plate.apply_transform(trimesh.transformations.rotation_matrix(tilt, [1.0, 2.0, 0.0]))
     with pytest.warns(MeshWarning, match=r"mm has nodes [0-9.]+ mm apart and a padding"):
@@ -123,9 +115,7 @@ def test_the_default_grid_of_a_thin_object_is_small_and_has_two_nodes_across(
     assert spacing <= size[2] / 2.0
 
 
-def test_a_thin_plate_has_its_distance_in_a_grid_of_few_nodes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_thin_plate_has_its_distance_in_a_grid_of_few_nodes(monkeypatch):
     monkeypatch.setattr("chsel.problem.sdf_grid.DEFAULT_NODES", 20_000)
     size = np.array([0.1, 0.06, 0.003])
     plate = trimesh.creation.box(size)
@@ -143,9 +133,7 @@ def test_a_thin_plate_has_its_distance_in_a_grid_of_few_nodes(
     assert np.abs(box_distance(on_it, size)).max() < grid.resolution / 2.0
 
 
-def test_a_mesh_has_one_default_grid_which_is_kept_while_there_is_room(
-    box: trimesh.Trimesh, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mesh_has_one_default_grid_which_is_kept_while_there_is_room(box, monkeypatch):
     grid = object_grid(box)
     assert grid.resolution == SIZE.min() / 20.0
     assert SdfGrid.from_mesh(box).digest == grid.digest
@@ -161,7 +149,7 @@ def test_a_mesh_has_one_default_grid_which_is_kept_while_there_is_room(
     assert not defaults._kept
 
 
-def test_the_grid_covers_the_padded_box_and_holds_the_distance(grid: SdfGrid) -> None:
+def test_the_grid_covers_the_padded_box_and_holds_the_distance(grid):
     lower, upper = grid.bounds
     assert (lower <= -SIZE / 2 - 0.05 + 1e-12).all()
     assert (upper >= SIZE / 2 + 0.05 - 1e-12).all()
@@ -169,7 +157,7 @@ def test_the_grid_covers_the_padded_box_and_holds_the_distance(grid: SdfGrid) ->
     np.testing.assert_allclose(grid.values.reshape(-1), box_sdf(nodes), atol=1e-8)
 
 
-def test_nearest_lookup_reads_the_nearest_node(grid: SdfGrid) -> None:
+def test_nearest_lookup_reads_the_nearest_node(grid):
     stream = np.random.default_rng(1)
     index = stream.integers(0, np.array(grid.shape), (200, 3))
     offset = stream.uniform(-0.0049, 0.0049, (200, 3))
@@ -179,7 +167,7 @@ def test_nearest_lookup_reads_the_nearest_node(grid: SdfGrid) -> None:
     np.testing.assert_array_equal(gradient, grid.gradients[tuple(index.T)])
 
 
-def test_trilinear_lookup_is_exact_for_a_linear_field() -> None:
+def test_trilinear_lookup_is_exact_for_a_linear_field():
     nodes = np.stack(np.meshgrid(*[np.arange(6) * 0.1] * 3, indexing="ij"), -1)
     slope = np.array([0.3, 0.5, 0.2])
     linear = SdfGrid(np.zeros(3), 0.1, nodes @ slope + 0.01, np.broadcast_to(slope, nodes.shape))
@@ -191,9 +179,7 @@ def test_trilinear_lookup_is_exact_for_a_linear_field() -> None:
 
 
 @pytest.mark.parametrize("lookup", ["nearest", "trilinear"])
-def test_beyond_the_grid_the_distance_stays_close_to_the_true_one(
-    grid: SdfGrid, lookup: str
-) -> None:
+def test_beyond_the_grid_the_distance_stays_close_to_the_true_one(grid, lookup):
     points = np.random.default_rng(3).uniform(-2.0, 2.0, (2000, 3))
     sdf, gradient = grid.at(points, lookup=lookup, outside="surface_point")
     true = box_sdf(points)
@@ -204,7 +190,7 @@ def test_beyond_the_grid_the_distance_stays_close_to_the_true_one(
     np.testing.assert_allclose((gradient[far] ** 2).sum(axis=1), 1.0, atol=1e-9)
 
 
-def test_bounding_box_distance_is_that_to_the_grid(grid: SdfGrid) -> None:
+def test_bounding_box_distance_is_that_to_the_grid(grid):
     _, upper = grid.bounds
     sdf, gradient = grid.at([[upper[0] + 0.3, 0.0, 0.0]], outside="bounding_box")
     assert float(sdf[0]) == pytest.approx(0.3)
@@ -212,9 +198,7 @@ def test_bounding_box_distance_is_that_to_the_grid(grid: SdfGrid) -> None:
 
 
 @pytest.mark.parametrize("lookup", ["nearest", "trilinear"])
-def test_active_cells_are_those_that_read_a_value_below_the_level(
-    grid: SdfGrid, lookup: str
-) -> None:
+def test_active_cells_are_those_that_read_a_value_below_the_level(grid, lookup):
     active = grid.active_cells(-0.01, lookup)
     points = np.random.default_rng(4).uniform(*grid.bounds, (20_000, 3))
     sdf, _ = grid.at(points, lookup=lookup)
@@ -227,7 +211,7 @@ def test_active_cells_are_those_that_read_a_value_below_the_level(
     assert 0.01 < flags.mean() < 0.3
 
 
-def test_grids_that_make_no_sense_are_refused(grid: SdfGrid, box: trimesh.Trimesh) -> None:
+def test_grids_that_make_no_sense_are_refused(grid, box):
     with pytest.raises(SdfError, match="border"):
         SdfGrid(grid.origin, 0.01, grid.values[10:], grid.gradients[10:])
     with pytest.raises(SdfError, match=r"SDF gradients has shape"):

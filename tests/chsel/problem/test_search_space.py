@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -10,16 +8,9 @@ from chsel import KnownPoints, SdfGrid
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.objective import Objective
 from chsel.errors import SettingError
-from chsel.problem.poses import (
-    Poses,
-    apply,
-    axis_angle,
-    compose,
-    inverse,
-    rotation_vector,
-)
-from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
-from chsel.qd.measures import MEASURES, Measure, measure_named
+from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, rotation_vector
+from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space
+from chsel.qd.measures import MEASURES, measure_named
 from tests.chsel.problem.torch_spaces import decode
 from tests.chsel.samples import random_poses
 
@@ -27,17 +18,17 @@ BOX = SdfGrid.from_mesh(trimesh.creation.box((0.2, 0.1, 0.06)), 0.01)
 STREAM = np.random.default_rng(0)
 
 
-def random_transforms(count: int) -> np.ndarray:
+def random_transforms(count):
     return random_poses(STREAM, count, 0.3)
 
 
-def test_nine_numbers_and_transforms_are_inverse_to_each_other() -> None:
+def test_nine_numbers_and_transforms_are_inverse_to_each_other():
     transforms = random_transforms(50)
     vectors = SE3Space().encode(Poses.of(transforms))
     np.testing.assert_allclose(SE3Space().poses(vectors).matrices, transforms, atol=1e-14)
 
 
-def test_raw_rows_decode_to_the_rotation_of_gram_schmidt() -> None:
+def test_raw_rows_decode_to_the_rotation_of_gram_schmidt():
     transforms = random_transforms(20)
     vectors = SE3Space().encode(Poses.of(transforms))
     vectors[:, 3:6] = 1.7 * vectors[:, 3:6] - 0.4 * vectors[:, 0:3]  # same span, same halves
@@ -45,14 +36,14 @@ def test_raw_rows_decode_to_the_rotation_of_gram_schmidt() -> None:
     np.testing.assert_allclose(SE3Space().poses(vectors).matrices, transforms, atol=1e-12)
 
 
-def test_degenerate_rows_decode_to_finite_numbers() -> None:
+def test_degenerate_rows_decode_to_finite_numbers():
     vectors = torch.zeros((2, 9), dtype=torch.float64)
     vectors[1, 0] = vectors[1, 3] = 1.0
     rotation, _ = decode(SE3Space(), vectors)
     assert bool(torch.isfinite(rotation).all())
 
 
-def test_plane_pose_of_a_tilted_rotation_is_the_nearest_by_frobenius() -> None:
+def test_plane_pose_of_a_tilted_rotation_is_the_nearest_by_frobenius():
     axis = np.array([0.0, 0.6, 0.8])
     space = SE2Space(PlaneSettings(axis=tuple(axis), offset=-0.1), BOX)
     for theta in np.linspace(-3.0, 3.0, 9):
@@ -60,7 +51,7 @@ def test_plane_pose_of_a_tilted_rotation_is_the_nearest_by_frobenius() -> None:
         rotation = axis_angle(axis, theta) @ tilt
         found = space.encode(Poses.of(compose(rotation, np.zeros(3))[None]))[0, 0]
 
-        def distance(angle: float, rotation: np.ndarray = rotation) -> float:
+        def distance(angle, rotation=rotation):
             return float(((axis_angle(axis, angle) - rotation) ** 2).sum())
 
         best = minimize_scalar(distance, bracket=(theta - 0.3, theta, theta + 0.3), tol=1e-12).x
@@ -68,7 +59,7 @@ def test_plane_pose_of_a_tilted_rotation_is_the_nearest_by_frobenius() -> None:
         assert abs(turns - round(turns)) * 2 * np.pi < 1e-6
 
 
-def test_plane_poses_survive_encoding_and_stay_on_the_plane() -> None:
+def test_plane_poses_survive_encoding_and_stay_on_the_plane():
     settings = PlaneSettings(axis=(0, 0, 2.0), offset=-0.1, resting_rotation=(np.pi / 2, 0, 0))
     space = SE2Space(settings, BOX)
     vectors = STREAM.uniform(-1.0, 1.0, (30, 3))
@@ -83,9 +74,7 @@ def test_plane_poses_survive_encoding_and_stay_on_the_plane() -> None:
     ("resting", "normal", "half"),
     [((0, 0, 0), (0, 0, 1), 0.03), ((np.pi / 2, 0, 0), (0, 1, 0), 0.05)],
 )
-def test_plane_height_puts_the_object_onto_the_plane(
-    resting: tuple[float, ...], normal: tuple[float, ...], half: float
-) -> None:
+def test_plane_height_puts_the_object_onto_the_plane(resting, normal, half):
     """A box at rest on a table at height 0.4, in every pose of the plane."""
     world_axis = np.array([0.0, 0.0, 1.0])
     axis = rotation_vector(np.array(resting)) @ world_axis
@@ -99,12 +88,12 @@ def test_plane_height_puts_the_object_onto_the_plane(
     np.testing.assert_allclose(np.abs(axis), normal, atol=1e-12)
 
 
-def objective_in(space: SearchSpace) -> Objective:
+def objective_in(space):
     return Objective(CompiledCost(BOX, KnownPoints(known=[[0.0, 0.0, 0.0]])), space)
 
 
 @pytest.mark.parametrize("name", sorted(MEASURES))
-def test_measures_have_the_gradients_of_their_values(name: str) -> None:
+def test_measures_have_the_gradients_of_their_values(name):
     planar = name.startswith("plane")
     axis = (0.0, 0.6, 0.8)
     space = SE2Space(PlaneSettings(axis=axis, offset=0.1), BOX) if planar else SE3Space()
@@ -112,12 +101,12 @@ def test_measures_have_the_gradients_of_their_values(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["position_3", "object_xy", "object_yaw"])
-def test_measures_of_plane_poses_have_the_gradients_of_their_values(name: str) -> None:
+def test_measures_of_plane_poses_have_the_gradients_of_their_values(name):
     space = SE2Space(PlaneSettings(axis=(0.0, 0.6, 0.8), offset=0.1), BOX)
     assert_gradients_of_values(space, measure_named(name, planar=True))
 
 
-def assert_gradients_of_values(space: SearchSpace, measure: Measure) -> None:
+def assert_gradients_of_values(space, measure):
     """Central differences, at vectors that are not orthonormal."""
     objective, step = objective_in(space), 1e-6
     for vector in np.random.default_rng(1).uniform(-1.0, 1.0, (5, space.dimension)):
@@ -131,7 +120,7 @@ def assert_gradients_of_values(space: SearchSpace, measure: Measure) -> None:
         assert (np.abs(gradients).max(axis=1) > 0.01).all()
 
 
-def test_measures_of_vectors_and_translations_are_their_entries() -> None:
+def test_measures_of_vectors_and_translations_are_their_entries():
     vectors = STREAM.uniform(-1.0, 1.0, (10, 9))
     objective = objective_in(SE3Space())
     for count in range(1, 7):
@@ -154,7 +143,7 @@ def test_measures_of_vectors_and_translations_are_their_entries() -> None:
     )
 
 
-def test_object_measures_are_of_world_from_object() -> None:
+def test_object_measures_are_of_world_from_object():
     transforms = random_transforms(10)
     vectors = SE3Space().encode(Poses.of(transforms))
     world, objective = inverse(transforms), objective_in(SE3Space())
@@ -164,7 +153,7 @@ def test_object_measures_are_of_world_from_object() -> None:
     np.testing.assert_allclose(yaw, np.arctan2(world[:, 1, 0], world[:, 0, 0]), atol=1e-12)
 
 
-def test_an_object_that_points_straight_up_has_a_yaw_and_no_gradient_of_it() -> None:
+def test_an_object_that_points_straight_up_has_a_yaw_and_no_gradient_of_it():
     """The object's x axis along the world's z: the heading is not defined."""
     rotation = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     vector = SE3Space().encode(Poses.of(compose(rotation[None], np.zeros((1, 3)))))
@@ -174,8 +163,8 @@ def test_an_object_that_points_straight_up_has_a_yaw_and_no_gradient_of_it() -> 
 
 
 @pytest.mark.parametrize("planar", [False, True])
-def test_compiled_decoding_is_that_of_torch(planar: bool) -> None:
-    space: SearchSpace = SE3Space()
+def test_compiled_decoding_is_that_of_torch(planar):
+    space = SE3Space()
     if planar:
         settings = PlaneSettings(axis=(0.3, 0.6, 0.8), offset=0.1, resting_rotation=(0.4, 1.0, 0.2))
         space = SE2Space(settings, BOX)
@@ -185,7 +174,7 @@ def test_compiled_decoding_is_that_of_torch(planar: bool) -> None:
     np.testing.assert_allclose(space.poses(vectors).matrices, expected, rtol=0.0, atol=3e-15)
 
 
-def test_a_measure_of_the_other_space_names_those_that_fit() -> None:
+def test_a_measure_of_the_other_space_names_those_that_fit():
     with pytest.raises(SettingError, match="only with plane; accepted: object_xy"):
         measure_named("plane_angle", planar=False)
     with pytest.raises(SettingError, match=r"only without plane; accepted: .*plane_position"):
@@ -195,6 +184,6 @@ def test_a_measure_of_the_other_space_names_those_that_fit() -> None:
 @pytest.mark.parametrize(
     "changes", [{}, {"plane_height": 0.0, "offset": 0.0}, {"axis": (0, 0, 0), "offset": 0.0}]
 )
-def test_planes_that_say_too_little_or_too_much_are_refused(changes: dict[str, object]) -> None:
+def test_planes_that_say_too_little_or_too_much_are_refused(changes):
     with pytest.raises(SettingError):
-        PlaneSettings(**changes)  # type: ignore[arg-type]
+        PlaneSettings(**changes)

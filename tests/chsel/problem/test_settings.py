@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import pytest
 
@@ -31,7 +30,7 @@ from chsel.problem.settings import (
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("method", METHODS)
-def test_every_preset_survives_the_way_through_a_mapping(method: str, preset: str) -> None:
+def test_every_preset_survives_the_way_through_a_mapping(method, preset):
     settings = preset_settings(method, preset)
     assert build_method(method, settings_mapping(settings)).settings == settings
 
@@ -49,9 +48,7 @@ def test_every_preset_survives_the_way_through_a_mapping(method: str, preset: st
         ({"archive": {"bins": 0}}, r"method.archive: bins is 0"),
     ],
 )
-def test_wrong_settings_name_the_key_and_what_is_accepted(
-    mapping: dict[str, object], message: str
-) -> None:
+def test_wrong_settings_name_the_key_and_what_is_accepted(mapping, message):
     with pytest.raises(SettingError, match=message):
         build_settings(ChselSettings, mapping, "method")
 
@@ -67,7 +64,7 @@ class Checked(CheckedSettings):
     limit: Annotated[float | None, positive, at_most(5.0)] = None
     free: float = -1.0
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         super().__post_init__()
         if self.limit is not None and self.rate > self.limit:
             raise SettingError(f"rate is {self.rate}; accepted: at most limit")
@@ -92,14 +89,12 @@ class Checked(CheckedSettings):
         ({"limit": 0.5, "name": "c"}, "name is 'c'; accepted: a, b"),
     ],
 )
-def test_settings_accept_what_their_annotations_and_their_class_accept(
-    values: dict[str, Any], message: str
-) -> None:
+def test_settings_accept_what_their_annotations_and_their_class_accept(values, message):
     with pytest.raises(SettingError, match=f"^{re.escape(message)}$"):
         Checked(**values)
 
 
-def test_values_at_the_limits_and_none_pass_where_the_type_has_it() -> None:
+def test_values_at_the_limits_and_none_pass_where_the_type_has_it():
     limits = Checked(count=1_000, length=10.0, limit=5.0)
     assert build_settings(Checked, settings_mapping(limits), "settings") == limits
     assert build_settings(Checked, {"limit": None, "rate": 2}, "settings") == Checked(rate=2.0)
@@ -136,10 +131,10 @@ Install = Callable[..., NamedChoices]
 
 
 @pytest.fixture
-def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
+def install(tmp_path, monkeypatch):
     """Installs packages that each offer a policy, as pip does; the choices that there are then."""
 
-    def done(*lines: str, settings: str = "{}") -> NamedChoices:
+    def done(*lines, settings="{}"):
         module = f"offered_by_{tmp_path.name}"  # imported once in a process
         for number, line in enumerate(lines):
             about = tmp_path / f"mine{number}-1.dist-info"
@@ -156,7 +151,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
     return done
 
 
-def test_a_choice_of_a_package_is_built_as_ours_are(install: Install) -> None:
+def test_a_choice_of_a_package_is_built_as_ours_are(install):
     choices = install("mine = mine:Mine")
     assert choices.names == ("grid", "mine")
     make, default = choices.entry("mine")
@@ -178,9 +173,7 @@ def test_a_choice_of_a_package_is_built_as_ours_are(install: Install) -> None:
         (["mine = mine:Mine"] * 2, "{}", "policy mine is of mine0 and mine1; accepted: one of"),
     ],
 )
-def test_what_cannot_be_taken_is_one_line(
-    install: Install, lines: list[str], settings: str, message: str
-) -> None:
+def test_what_cannot_be_taken_is_one_line(install, lines, settings, message):
     choices = install(*lines, settings=settings)
     with pytest.raises(SettingError) as caught:
         choices.entry("mine")
@@ -189,7 +182,7 @@ def test_what_cannot_be_taken_is_one_line(
     assert choices.build("grid")  # others go on as ever
 
 
-def test_a_name_of_ours_is_not_taken_from_us(install: Install) -> None:
+def test_a_name_of_ours_is_not_taken_from_us(install):
     choices = install("grid = mine:Mine")
     assert choices.names == ("grid",)
     with pytest.raises(SettingError, match="policy grid is of package mine0, too; accepted: one"):

@@ -1,12 +1,9 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
 
 from chsel import SdfGrid
 from chsel.errors import SdfError
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import surface_points
@@ -17,18 +14,18 @@ SIDES = np.array([0.163, 0.107, 0.089])
 COUNT = 4000
 
 
-def stream(seed: int = 0) -> np.random.Generator:
+def stream(seed=0):
     return StreamKey(seed, 0).stream(Purpose.ICP_SURFACE)
 
 
-def chi_square(counts: FloatArray, shares: FloatArray) -> float:
+def chi_square(counts, shares):
     """How unlike counts are to shares: mean 1 per degree of freedom, here in deviations off it."""
     expected = counts.sum() * shares / shares.sum()
     total, freedom = (((counts - expected) ** 2) / expected).sum(), len(counts) - 1
     return float((total - freedom) / np.sqrt(2.0 * freedom))
 
 
-def test_points_are_on_a_sphere_and_uniform_there() -> None:
+def test_points_are_on_a_sphere_and_uniform_there():
     points = surface_points(ball_grid(RADIUS, RESOLUTION, 10), COUNT, stream())
     distance = np.sqrt((points**2).sum(axis=1)) - RADIUS
     assert np.abs(distance).max() < 0.02 * RESOLUTION
@@ -39,7 +36,7 @@ def test_points_are_on_a_sphere_and_uniform_there() -> None:
     assert abs(chi_square(counts, np.ones(96))) < 3.0
 
 
-def test_points_are_on_a_box_and_uniform_there() -> None:
+def test_points_are_on_a_box_and_uniform_there():
     mesh = trimesh.creation.box(SIDES)
     points = surface_points(SdfGrid.from_mesh(mesh, RESOLUTION), COUNT, stream())
     distance = np.abs(mesh_sdf(mesh, points)[0])
@@ -61,7 +58,7 @@ def test_points_are_on_a_box_and_uniform_there() -> None:
     assert np.concatenate(counts).sum() > 0.5 * COUNT
 
 
-def test_points_depend_on_the_stream_alone() -> None:
+def test_points_depend_on_the_stream_alone():
     grid, again = ball_grid(RADIUS, RESOLUTION, 10), ball_grid(RADIUS, RESOLUTION, 10)
     first = surface_points(grid, 50, stream())
     np.testing.assert_array_equal(surface_points(grid, 50, stream()), first)
@@ -69,7 +66,7 @@ def test_points_depend_on_the_stream_alone() -> None:
     assert np.abs(surface_points(grid, 50, stream(1)) - first).max() > 0.01
 
 
-def test_a_single_node_inside_has_a_surface() -> None:
+def test_a_single_node_inside_has_a_surface():
     values = np.full((4, 4, 4), 0.01)
     values[1, 1, 1] = -0.004
     grid = SdfGrid(np.zeros(3), 0.01, values, np.zeros((4, 4, 4, 3)))
@@ -80,7 +77,7 @@ def test_a_single_node_inside_has_a_surface() -> None:
     np.testing.assert_allclose(surface_points(grid, 3, stream()), 0.01, atol=1e-12)
 
 
-def test_an_object_between_the_nodes_is_refused() -> None:
+def test_an_object_between_the_nodes_is_refused():
     grid = SdfGrid(np.zeros(3), 0.01, np.full((4, 4, 4), 0.01), np.zeros((4, 4, 4, 3)))
     with pytest.raises(SdfError, match="no node of the SDF grid is inside"):
         surface_points(grid, 3, stream())

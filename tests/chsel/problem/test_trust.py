@@ -1,7 +1,5 @@
 """Whether hypotheses explain the known points, and whether they are alike."""
 
-from __future__ import annotations
-
 import math
 from itertools import permutations
 
@@ -11,11 +9,10 @@ import trimesh
 
 import chsel
 from chsel.errors import PoseError, SettingError
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.noise import LIMIT, noise_model
 from chsel.problem.outline import outline_distances
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
-from chsel.problem.registration_problem import VERDICTS, Hypotheses, RegistrationProblem
+from chsel.problem.registration_problem import VERDICTS, RegistrationProblem
 from chsel.problem.streams import StreamKey
 from chsel.problem.trust import (
     FOREIGN_CONTACT,
@@ -47,39 +44,39 @@ CENTRE = np.array([0.3, 0.2, 0.1])
 POSE = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(0.7)), CENTRE)  # world_from_object
 
 
-def problem(points: chsel.KnownPoints, sdf: chsel.SdfGrid = BALL) -> RegistrationProblem:
+def problem(points, sdf=BALL):
     workspace = chsel.Workspace((-1, -1, -1), (1, 1, 1))
     return RegistrationProblem(sdf, points, np.eye(4)[None], workspace, VOXEL, StreamKey(0, 0))
 
 
-def hypotheses(*world_from_object: FloatArray) -> Hypotheses:
+def hypotheses(*world_from_object):
     return hypotheses_at(inverse(np.array(world_from_object)))
 
 
-def moved(x: float = 0.0, y: float = 0.0, z: float = 0.0, about_z: float = 0.0) -> FloatArray:
+def moved(x=0.0, y=0.0, z=0.0, about_z=0.0):
     """POSE after a motion of the object in its own frame, metres and radians."""
     turn = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(about_z))
     return np.asarray(POSE @ compose(turn, np.array([x, y, z])))
 
 
-def at_height(*heights: float) -> FloatArray:
+def at_height(*heights):
     """Points above and below the surface of the ball at CENTRE, in the world."""
     return CENTRE + (RADIUS + np.resize(heights, len(NORMALS)))[:, None] * NORMALS
 
 
-def ball() -> Hypotheses:
+def ball():
     """Hypotheses that have the ball at CENTRE, turned; a ball looks the same."""
     turns = axis_angle(np.eye(3), np.array([0.5, 1.0, 2.0]))
     return hypotheses(*compose(turns, np.tile(CENTRE, (3, 1))))
 
 
-def on_box(noise: float = 0.0) -> FloatArray:
+def on_box(noise=0.0):
     surface, face = trimesh.sample.sample_surface(BOX, 60, seed=1)
     away = noise * np.random.default_rng(0).standard_normal((60, 1)) * BOX.face_normals[face]
     return apply(POSE, surface + away)
 
 
-def test_turns_that_a_symmetry_undoes_are_one_mode() -> None:
+def test_turns_that_a_symmetry_undoes_are_one_mode():
     trust = trust_in(problem(chsel.KnownPoints(known=at_height(0.0))), ball(), NOISE)
     assert (trust.verdict, trust.modes) == ("determined", 1)
     assert trust.spread < 0.0005
@@ -89,7 +86,7 @@ def test_turns_that_a_symmetry_undoes_are_one_mode() -> None:
     assert trust_in(problem(chsel.KnownPoints(known=on_box()), GRID), half_turn).modes == 1
 
 
-def test_numbers_are_those_of_the_points_at_the_best_hypothesis() -> None:
+def test_numbers_are_those_of_the_points_at_the_best_hypothesis():
     points = chsel.KnownPoints(known=on_box(noise=0.002))
     trust = trust_in(problem(points, GRID), hypotheses(POSE, moved(x=0.0005)), NOISE)
     assert trust.noise == pytest.approx(0.002, rel=0.15)
@@ -98,7 +95,7 @@ def test_numbers_are_those_of_the_points_at_the_best_hypothesis() -> None:
     assert trust.numbers["verdict"] == VERDICTS.index("determined") == 0
 
 
-def test_foreign_points_are_counted_and_do_not_change_the_verdict() -> None:
+def test_foreign_points_are_counted_and_do_not_change_the_verdict():
     known = on_box(noise=0.0005)
     known[:6] += np.linspace(0.03, 5.0, 6)[:, None]
     trust = trust_in(problem(chsel.KnownPoints(known=known), GRID), hypotheses(POSE), NOISE)
@@ -113,7 +110,7 @@ def test_foreign_points_are_counted_and_do_not_change_the_verdict() -> None:
 @pytest.mark.parametrize(
     ("height", "fits"), [(0.0, True), (0.9, True), (1.1, False), (-1.1, False)]
 )
-def test_errors_of_noise_may_be_a_share_of_the_diameter(height: float, fits: bool) -> None:
+def test_errors_of_noise_may_be_a_share_of_the_diameter(height, fits):
     """Signs at random, so that neighbours have nothing in common."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], len(NORMALS))
     height = height * MOST_OFF * BALL.diameter
@@ -122,7 +119,7 @@ def test_errors_of_noise_may_be_a_share_of_the_diameter(height: float, fits: boo
 
 
 @pytest.mark.parametrize(("height", "fits"), [(0.9, True), (1.1, False), (-1.1, False)])
-def test_errors_of_whole_sides_may_be_less(height: float, fits: bool) -> None:
+def test_errors_of_whole_sides_may_be_less(height, fits):
     points = chsel.KnownPoints(known=at_height(height * MOST_SYSTEMATIC * BALL.diameter))
     assert (trust_in(problem(points), ball()).verdict != "nothing fits") is fits
     told = trust_in(problem(points), ball(), 0.01)  # a sensor as bad as that explains all of them
@@ -130,7 +127,7 @@ def test_errors_of_whole_sides_may_be_less(height: float, fits: bool) -> None:
 
 
 @pytest.mark.parametrize(("levels", "fits"), [(0.9, True), (1.1, False)])
-def test_contacts_may_not_be_off_by_more_than_any_sensor_is(levels: float, fits: bool) -> None:
+def test_contacts_may_not_be_off_by_more_than_any_sensor_is(levels, fits):
     sizes = np.random.default_rng(0).standard_normal(len(NORMALS))
     heights = levels * MOST_NOISE / np.sqrt((sizes**2).mean()) * sizes
     posed = problem(chsel.KnownPoints(known=at_height(*heights)))
@@ -142,7 +139,7 @@ def test_contacts_may_not_be_off_by_more_than_any_sensor_is(levels: float, fits:
 
 
 @pytest.mark.parametrize("scale", [1.2, 1.0 / 1.2])
-def test_a_wrong_scale_fits_nothing(scale: float) -> None:
+def test_a_wrong_scale_fits_nothing(scale):
     sdf = chsel.SdfGrid.from_mesh(BOX.copy().apply_scale(scale), 0.004)
     trust = trust_in(problem(chsel.KnownPoints(known=on_box()), sdf), hypotheses(POSE))
     (warning,) = check_trust(trust)
@@ -153,7 +150,7 @@ def test_a_wrong_scale_fits_nothing(scale: float) -> None:
     assert check_trust(shifted)[0].text == warning.text
 
 
-def test_a_sensor_less_exact_than_stated_is_a_warning() -> None:
+def test_a_sensor_less_exact_than_stated_is_a_warning():
     points = problem(chsel.KnownPoints(known=on_box(noise=0.002)), GRID)
     trust = trust_in(points, hypotheses(POSE), 0.0001)
     assert trust.verdict == "determined"
@@ -166,7 +163,7 @@ def test_a_sensor_less_exact_than_stated_is_a_warning() -> None:
     assert check_trust(trust_in(points, hypotheses(POSE))) == []
 
 
-def test_known_distances_count_and_not_the_surface_alone() -> None:
+def test_known_distances_count_and_not_the_surface_alone():
     points = at_height(0.05)
     right = chsel.KnownPoints(known=points, known_sdf=np.full(len(points), 0.05))
     assert trust_in(problem(right), ball()).verdict == "determined"
@@ -174,7 +171,7 @@ def test_known_distances_count_and_not_the_surface_alone() -> None:
     assert trust_in(problem(wrong), ball()).verdict == "nothing fits"
 
 
-def test_free_points_within_a_voxel_and_a_few_deeper_ones_contradict_nothing() -> None:
+def test_free_points_within_a_voxel_and_a_few_deeper_ones_contradict_nothing():
     contacts = at_height(0.0)
     for depth, count, fits in ((0.9, 60, True), (6.0, 3, True), (6.0, 60, False)):
         free = np.concatenate([at_height(0.05), at_height(-depth * VOXEL)[:count]])
@@ -182,13 +179,13 @@ def test_free_points_within_a_voxel_and_a_few_deeper_ones_contradict_nothing() -
         assert (trust_in(problem(points), ball()).verdict != "nothing fits") is fits
 
 
-def test_occupied_points_must_not_be_far_outside() -> None:
+def test_occupied_points_must_not_be_far_outside():
     for height, fits in ((-0.05, True), (0.9 * VOXEL, True), (0.05, False)):
         points = chsel.KnownPoints(occupied=at_height(height))
         assert (trust_in(problem(points), ball()).verdict != "nothing fits") is fits
 
 
-def test_poses_that_fit_one_corner_are_modes_and_far_ones_do_not_count() -> None:
+def test_poses_that_fit_one_corner_are_modes_and_far_ones_do_not_count():
     """A corner is touched, near it alone: the three sides of a box can lie along it in six ways."""
     corner = np.array([[x, y, 0.0] for x in (0.005, 0.02, 0.035) for y in (0.005, 0.02, 0.035)])
     known = apply(POSE, np.concatenate([np.roll(corner, n, axis=1) for n in range(3)]))
@@ -210,7 +207,7 @@ def test_poses_that_fit_one_corner_are_modes_and_far_ones_do_not_count() -> None
 
 
 @pytest.mark.parametrize("shifts", [[0.0], [0.0, 0.001, 0.03, 0.031], np.linspace(0.0, 0.04, 12)])
-def test_samples_of_a_continuum_are_no_modes(shifts: list[float]) -> None:
+def test_samples_of_a_continuum_are_no_modes(shifts):
     """One flat side is touched: the box may stand anywhere along it."""
     side = np.array([[0.05, y, z] for y in (-0.02, 0.0, 0.02) for z in (-0.04, 0.0, 0.04)])
     posed = problem(chsel.KnownPoints(known=apply(POSE, side)), GRID)
@@ -220,24 +217,24 @@ def test_samples_of_a_continuum_are_no_modes(shifts: list[float]) -> None:
 
 
 @pytest.fixture
-def held(monkeypatch: pytest.MonkeyPatch) -> None:
+def held(monkeypatch):
     """No pose can be moved, so that the verdict depends on the poses of the set."""
     monkeypatch.setattr("chsel.problem.trust.can_be_moved", lambda *_: False)
 
 
-def lying(z: float = 0.0) -> FloatArray:
+def lying(z=0.0):
     """The box with its side across y where that across x is at POSE, shifted along it."""
     quarter = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(-0.5 * np.pi))
     return np.asarray(POSE @ compose(quarter, np.array([0.02, 0.0, z])))
 
 
-def touched_on_one_side() -> RegistrationProblem:
+def touched_on_one_side():
     side = np.array([[0.05, y, z] for y in (-0.02, 0.0, 0.02) for z in (-0.04, 0.0, 0.04)])
     return problem(chsel.KnownPoints(known=apply(POSE, side)), GRID)
 
 
 @pytest.mark.usefixtures("held")
-def test_a_set_is_wide_where_any_mode_is() -> None:
+def test_a_set_is_wide_where_any_mode_is():
     steps, posed = np.arange(0.0, 0.041, 0.01), touched_on_one_side()
     narrow, wide = [POSE, moved(z=0.01)], [moved(z=step) for step in steps]
     others = [lying(), lying(0.01)]
@@ -252,7 +249,7 @@ def test_a_set_is_wide_where_any_mode_is() -> None:
 
 @pytest.mark.usefixtures("held")
 @pytest.mark.parametrize(("count", "verdict"), [(MOST_MODES, "several modes"), (9, "wide")])
-def test_a_set_of_very_many_modes_is_wide(count: int, verdict: str) -> None:
+def test_a_set_of_very_many_modes_is_wide(count, verdict):
     """Balls all around one contact, each a mode; a free point far away is the only evidence."""
     contact, sides = CENTRE, trimesh.creation.icosahedron().vertices[:count]
     centres = contact + RADIUS * sides / np.linalg.norm(sides, axis=1, keepdims=True)
@@ -262,12 +259,10 @@ def test_a_set_of_very_many_modes_is_wide(count: int, verdict: str) -> None:
 
 
 @pytest.mark.parametrize("movable", [0, 1])
-def test_a_set_is_wide_where_any_mode_can_be_moved(
-    monkeypatch: pytest.MonkeyPatch, movable: int
-) -> None:
+def test_a_set_is_wide_where_any_mode_can_be_moved(monkeypatch, movable):
     found = hypotheses(POSE, lying())
 
-    def can_be_moved(_: RegistrationProblem, pose: Poses, *__: float) -> bool:
+    def can_be_moved(_, pose, *__):
         return np.array_equal(pose.matrices[0], found.object_from_world[movable])
 
     monkeypatch.setattr("chsel.problem.trust.can_be_moved", can_be_moved)
@@ -275,7 +270,7 @@ def test_a_set_is_wide_where_any_mode_can_be_moved(
 
 
 @pytest.mark.usefixtures("held")
-def test_poses_within_the_noise_are_one_mode() -> None:
+def test_poses_within_the_noise_are_one_mode():
     """A ball whose distances are known to points on a ring is on one side of the ring or another.
 
     The noise is the same on both sides.
@@ -296,7 +291,7 @@ def test_poses_within_the_noise_are_one_mode() -> None:
 
 
 @pytest.mark.usefixtures("held")
-def test_poses_that_leave_out_one_of_few_contacts_are_rivals() -> None:
+def test_poses_that_leave_out_one_of_few_contacts_are_rivals():
     """A box slid until one contact is in the air, and off the others by as much as is allowed."""
     side = [[0.05, y, z] for y in (-0.02, 0.0, 0.02) for z in (-0.04, 0.04)]
     known = np.array([*side, [0.02, 0.03, -0.03], [0.0, 0.0, 0.08], [-0.02, 0.03, 0.03]])
@@ -321,7 +316,7 @@ def test_poses_that_leave_out_one_of_few_contacts_are_rivals() -> None:
         assert trust_in(posed, alone, NOISE, apart).verdict == "determined"
 
 
-def test_twins_are_told_apart_and_true_symmetries_are_not() -> None:
+def test_twins_are_told_apart_and_true_symmetries_are_not():
     """A quarter turn of a box moves its sides by 3 mm; contacts lie half of that off in both."""
     sdf = chsel.SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.106, 0.16)), 0.004)
     corners = [[y, z] for y in (-0.03, 0.03) for z in (-0.06, 0.06)]
@@ -345,7 +340,7 @@ def test_twins_are_told_apart_and_true_symmetries_are_not() -> None:
         assert str(trust).startswith(start)
 
 
-def test_turns_count_beyond_symmetries() -> None:
+def test_turns_count_beyond_symmetries():
     """A box with sides 0.1 and 0.106: a quarter turn moves 3 mm, one of 0.1 and 0.101 less."""
     for other, expected in ((0.106, True), (0.101, False)):
         sdf = chsel.SdfGrid.from_mesh(trimesh.creation.box((0.1, other, 0.16)), 0.004)
@@ -358,7 +353,7 @@ def test_turns_count_beyond_symmetries() -> None:
         assert not turned(sdf, poses, np.eye(5, dtype=bool)).any()
 
 
-def test_the_spread_is_the_root_mean_square_of_surfaces_of_all_pairs() -> None:
+def test_the_spread_is_the_root_mean_square_of_surfaces_of_all_pairs():
     """Of balls d apart, each point of a surface is d |cos| off the other, d / sqrt(3) on average.
 
     Three balls in a row have four of nine pairs d apart, and two of them 2 d."""
@@ -369,7 +364,7 @@ def test_the_spread_is_the_root_mean_square_of_surfaces_of_all_pairs() -> None:
     assert trust.spread == pytest.approx(expected, rel=0.1)  # of 100 points
 
 
-def test_points_that_a_pose_can_fit_exactly_are_no_evidence() -> None:
+def test_points_that_a_pose_can_fit_exactly_are_no_evidence():
     """Six contacts of a ball, which no motion leaves, and the same with one more or free points."""
     contacts = at_height(0.0)
     for count, free, verdict in ((6, 0, "wide"), (7, 0, "determined"), (6, 60, "determined")):
@@ -383,7 +378,7 @@ def test_points_that_a_pose_can_fit_exactly_are_no_evidence() -> None:
     assert "no evidence" not in str(trust)
 
 
-def test_distances_of_outlines_are_those_of_shifts_and_turns() -> None:
+def test_distances_of_outlines_are_those_of_shifts_and_turns():
     """A shift along x moves the two sides across x by it, and the others within themselves."""
     shift = 0.01
     poses = Poses.of(inverse(np.array([POSE, moved(x=shift), moved(about_z=math.pi)])))
@@ -394,7 +389,7 @@ def test_distances_of_outlines_are_those_of_shifts_and_turns() -> None:
     np.testing.assert_array_equal(apart, apart.T)
 
 
-def test_errors_are_alike_on_sides_and_not_in_noise() -> None:
+def test_errors_are_alike_on_sides_and_not_in_noise():
     signs = np.where(NORMALS[:, 0] > 0.0, 1.0, -1.0)
     assert correlation(NORMALS, signs) > 0.7
     assert abs(correlation(NORMALS, np.random.default_rng(0).standard_normal(60))) < 0.3
@@ -402,7 +397,7 @@ def test_errors_are_alike_on_sides_and_not_in_noise() -> None:
     assert correlation(NORMALS, np.zeros(60)) == 0.0
 
 
-def test_poses_that_are_not_finite_or_repeated_are_left_out() -> None:
+def test_poses_that_are_not_finite_or_repeated_are_left_out():
     posed = problem(chsel.KnownPoints(known=at_height(0.0)))
     found = ball()
     poses = found.object_from_world.copy()
@@ -416,7 +411,7 @@ def test_poses_that_are_not_finite_or_repeated_are_left_out() -> None:
         trust_in(posed, found, 0.0)
 
 
-def test_an_object_thinner_than_its_grid_is_judged_too() -> None:
+def test_an_object_thinner_than_its_grid_is_judged_too():
     """No node is inside, and no point of the surface known exactly."""
     plate = trimesh.creation.box((0.1, 0.1, 0.001))
     sdf = chsel.SdfGrid.from_mesh(plate, 0.0085)

@@ -1,15 +1,12 @@
 """The decoding of search vectors in torch: the reference for that of the kernels."""
 
-from __future__ import annotations
-
 import torch
-from torch import Tensor
 
 from chsel.problem.poses import hat
-from chsel.problem.search_space import SE2Space, SearchSpace
+from chsel.problem.search_space import SE2Space
 
 
-def decode(space: SearchSpace, vectors: Tensor) -> tuple[Tensor, Tensor]:
+def decode(space, vectors):
     """Rotations (B, 3, 3) and translations (B, 3) of vectors (B, d), differentiable."""
     if not isinstance(space, SE2Space):
         return _gram_schmidt(vectors[:, :6]), vectors[:, 6:9]
@@ -24,7 +21,7 @@ def decode(space: SearchSpace, vectors: Tensor) -> tuple[Tensor, Tensor]:
     return rotation, vectors[:, 1:2] * e_u + vectors[:, 2:3] * e_v + space.offset * axis
 
 
-def _gram_schmidt(rows: Tensor) -> Tensor:
+def _gram_schmidt(rows):
     """Rotations (B, 3, 3) of raw 6-D vectors (B, 6) by Gram-Schmidt on two rows (Zhou et al.)."""
     first, second = rows[:, 0:3], rows[:, 3:6]
     b1 = _unit(first)
@@ -33,5 +30,5 @@ def _gram_schmidt(rows: Tensor) -> Tensor:
     return torch.stack([b1, b2, torch.linalg.cross(b1, b2)], dim=1)
 
 
-def _unit(vectors: Tensor) -> Tensor:
+def _unit(vectors):
     return vectors / vectors.norm(dim=1, keepdim=True).clamp_min(1e-12)

@@ -1,7 +1,5 @@
 """Contacts of a soft membrane with a camera behind it, and of a body by the force on it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -9,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from chsel.errors import PointsError
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import roll_pitch_yaw
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.sensing.contact_sensing import (
@@ -29,7 +26,7 @@ CENTRE = np.array([0.006, -0.004, MEMBRANE + RADIUS - PRESSED])
 
 
 @pytest.fixture
-def pressed() -> FloatArray:
+def pressed():
     """Depths of a flat membrane that lies on a sphere where it touches it."""
     ways = CAMERA.directions()
     a, b = (ways**2).sum(axis=-1), (ways * CENTRE).sum(axis=-1)
@@ -38,7 +35,7 @@ def pressed() -> FloatArray:
     return np.minimum(first, MEMBRANE)
 
 
-def test_a_sphere_is_touched_where_it_has_pressed_far_enough(pressed: FloatArray) -> None:
+def test_a_sphere_is_touched_where_it_has_pressed_far_enough(pressed):
     imprint = deformation(np.full(pressed.shape, MEMBRANE), pressed)
     assert imprint.max() == pytest.approx(PRESSED, abs=1e-4)
     mask = contact_mask(smooth(imprint, 10), quantile=0.9, threshold=0.004)
@@ -54,14 +51,14 @@ def test_a_sphere_is_touched_where_it_has_pressed_far_enough(pressed: FloatArray
     np.testing.assert_allclose(middle, CENTRE[:2], atol=0.0005)
 
 
-def test_the_quantile_bounds_a_contact_that_is_larger(pressed: FloatArray) -> None:
+def test_the_quantile_bounds_a_contact_that_is_larger(pressed):
     imprint = deformation(np.full(pressed.shape, MEMBRANE), pressed)
     mask = contact_mask(imprint, quantile=0.98, threshold=0.004)
     assert mask.mean() == pytest.approx(0.02, abs=1e-3)
     assert imprint[mask].min() >= imprint[~mask].max()
 
 
-def test_pixels_that_were_not_measured_are_not_deformed() -> None:
+def test_pixels_that_were_not_measured_are_not_deformed():
     reference = np.array([[0.1, 0.1, 0.0, np.nan, 0.1, 0.1]])
     depth = np.array([[0.08, np.nan, 0.08, 0.08, -1.0, 0.11]])
     expected = [[0.02, 0.0, 0.0, 0.0, 0.0, -0.01]]
@@ -73,7 +70,7 @@ def test_pixels_that_were_not_measured_are_not_deformed() -> None:
 
 
 @pytest.mark.parametrize("side", [1, 2, 3, 4, 10])
-def test_the_filter_is_the_mean_around_each_pixel(side: int) -> None:
+def test_the_filter_is_the_mean_around_each_pixel(side):
     image = np.random.default_rng(0).uniform(0.0, 0.01, (12, 14))
     smoothed = smooth(image, side)
     reflected = np.pad(image, 10, mode="symmetric")
@@ -83,7 +80,7 @@ def test_the_filter_is_the_mean_around_each_pixel(side: int) -> None:
         assert smoothed[row, column] == pytest.approx(mean, abs=1e-15)
 
 
-def test_one_bad_pixel_does_not_spoil_its_row() -> None:
+def test_one_bad_pixel_does_not_spoil_its_row():
     image = np.full((8, 8), 0.004)
     image[2, 2] = np.nan
     smoothed = smooth(image, 3)
@@ -91,20 +88,20 @@ def test_one_bad_pixel_does_not_spoil_its_row() -> None:
     assert smoothed[2, 6] == pytest.approx(0.004)
 
 
-def test_without_valid_pixels_there_is_no_contact() -> None:
+def test_without_valid_pixels_there_is_no_contact():
     nothing = np.zeros((4, 5), dtype=bool)
     mask = contact_mask(np.ones((4, 5)), quantile=0.9, threshold=0.0, valid=nothing)
     assert mask.shape == (4, 5)
     assert not mask.any()
 
 
-def test_pixels_that_do_not_count_are_not_in_the_quantile_or_in_contact() -> None:
+def test_pixels_that_do_not_count_are_not_in_the_quantile_or_in_contact():
     imprint = np.arange(20.0).reshape(4, 5)
     mask = contact_mask(imprint, quantile=0.5, threshold=1.0, valid=imprint < 10.0)
     assert imprint[mask].tolist() == [5.0, 6.0, 7.0, 8.0, 9.0]
 
 
-def test_subsets_are_ascending_seeded_and_all_alike() -> None:
+def test_subsets_are_ascending_seeded_and_all_alike():
     key = StreamKey(3, 1)
     chosen = contact_subset(200, 50, key.stream(Purpose.CONTACT_POINTS))
     assert len(chosen) == 50
@@ -118,7 +115,7 @@ def test_subsets_are_ascending_seeded_and_all_alike() -> None:
 
 
 @given(st.lists(st.integers(0, 1000), max_size=5), st.integers(0, 200))
-def test_shares_are_in_proportion_and_sum_up(counts: list[int], most: int) -> None:
+def test_shares_are_in_proportion_and_sum_up(counts, most):
     shares = share(counts, most)
     total = sum(counts)
     assert sum(shares) == min(most, total)
@@ -128,7 +125,7 @@ def test_shares_are_in_proportion_and_sum_up(counts: list[int], most: int) -> No
             assert abs(part - count * most / total) < 1.0
 
 
-def test_shares_by_hand() -> None:
+def test_shares_by_hand():
     assert share([30, 10], 50) == [30, 10]
     assert share([300, 100], 50) == [38, 12]  # 37.5 and 12.5: the first among equals
     assert share([1, 1, 98], 50) == [1, 0, 49]
@@ -139,7 +136,7 @@ SPHERE = trimesh.creation.icosphere(4, 0.05)
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_contact_is_found_from_its_force_and_torque(seed: int) -> None:
+def test_a_contact_is_found_from_its_force_and_torque(seed):
     stream = np.random.default_rng(seed)
     face = int(stream.integers(len(SPHERE.faces)))
     point = SPHERE.triangles_center[face]
@@ -154,14 +151,14 @@ def test_a_contact_is_found_from_its_force_and_torque(seed: int) -> None:
     assert found.miss == 0.0
 
 
-def test_of_overlapping_bodies_the_outer_surface_is_met() -> None:
+def test_of_overlapping_bodies_the_outer_surface_is_met():
     both = np.concatenate([BOX, BOX + np.array([0.01, 0.0, 0.0])])
     for force, x in (([3.0, 0, 0], -0.02), ([-3.0, 0, 0], 0.03)):
         found = contact_on_axis(np.array(force), np.zeros(3), both)
         np.testing.assert_allclose(found.point, [x, 0.0, 0.0], atol=1e-12)
 
 
-def test_a_line_that_misses_gives_the_nearest_point_of_an_edge() -> None:
+def test_a_line_that_misses_gives_the_nearest_point_of_an_edge():
     force, point = np.array([-5.0, 0.0, 0.0]), np.array([0.3, 0.034, 0.01])
     found = contact_on_axis(force, np.cross(point, force), BOX)
     assert found.miss == pytest.approx(0.004)
@@ -169,7 +166,7 @@ def test_a_line_that_misses_gives_the_nearest_point_of_an_edge() -> None:
     assert abs(found.point[0]) == pytest.approx(0.02)
 
 
-def test_without_torque_the_foremost_part_against_the_force_is_touched() -> None:
+def test_without_torque_the_foremost_part_against_the_force_is_touched():
     found = contact_ahead(np.array([0.0, 0.0, -2.0]), BOX)
     np.testing.assert_allclose(found.point, [0.0, 0.0, 0.05], atol=1e-12)
     np.testing.assert_allclose(found.normal, [0.0, 0.0, 1.0])
@@ -178,7 +175,7 @@ def test_without_torque_the_foremost_part_against_the_force_is_touched() -> None
     np.testing.assert_allclose(corner[2], turned[..., 2].max(), atol=1e-12)
 
 
-def test_forces_along_edges_and_through_corners_have_an_answer() -> None:
+def test_forces_along_edges_and_through_corners_have_an_answer():
     for point in ([0.02, 0.03, 0.0], [0.02, 0.03, 0.05], [0.02, 0.0, 0.05]):
         for force in ([-1.0, 0, 0], [0, 0, -1.0], [-1.0, -1.0, -1.0]):
             at, push = np.array(point), np.array(force)

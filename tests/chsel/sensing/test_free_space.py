@@ -1,7 +1,5 @@
 """Free space: rays, points, views, and the way of solids."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np
@@ -12,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chsel.errors import PointsError, PoseError, SettingError
-from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import FreeVoxels, Lattice, Workspace
 from chsel.problem.poses import apply, axis_angle, compose, inverse, rotated
 from chsel.sensing.depth_camera import PinholeCamera
@@ -34,11 +31,11 @@ TILTED = axis_angle(np.array([0.0, 1.0, 0.0]), 0.5) @ LOOKING_ALONG_X
 POSE = compose(TILTED, np.array([0.35, 0.02, 0.8]))
 
 
-def grid(views: int = 1) -> FreeGrid:
+def grid(views=1):
     return FreeGrid(WORKSPACE, SPACING, views=views)
 
 
-def voxels(centres: FloatArray) -> set[tuple[int, ...]]:
+def voxels(centres):
     indices = Lattice(WORKSPACE.lower, SPACING).voxels(centres)
     found = {tuple(index) for index in indices.tolist()}
     assert len(found) == len(centres)
@@ -46,7 +43,7 @@ def voxels(centres: FloatArray) -> set[tuple[int, ...]]:
 
 
 @pytest.fixture
-def image() -> tuple[FloatArray, BoolArray]:
+def image():
     """Depths between 0.3 and 1.2 m, some of them missing, and what to use of them."""
     stream = np.random.default_rng(3)
     depth = stream.uniform(0.3, 1.2, (48, 64))
@@ -56,11 +53,11 @@ def image() -> tuple[FloatArray, BoolArray]:
     return depth, stream.random(depth.shape) < 0.8
 
 
-def test_the_grid_is_the_lattice_up_to_the_upper_corner() -> None:
+def test_the_grid_is_the_lattice_up_to_the_upper_corner():
     assert grid().shape == (41, 41, 30)
 
 
-def test_a_ray_along_an_axis_passes_a_row_of_voxels_with_both_ends() -> None:
+def test_a_ray_along_an_axis_passes_a_row_of_voxels_with_both_ends():
     free = grid()
     assert free.along_rays([0.752, 0.001, 0.4], [[0.898, 0.001, 0.4]]) == 16
     expected = np.array([[0.7 + 0.01 * i, 0.0, 0.4] for i in range(5, 21)])
@@ -68,14 +65,14 @@ def test_a_ray_along_an_axis_passes_a_row_of_voxels_with_both_ends() -> None:
     assert free.count == 16
 
 
-def test_a_ray_into_the_workspace_begins_at_its_border() -> None:
+def test_a_ray_into_the_workspace_begins_at_its_border():
     free = grid()
     assert free.along_rays([-1.0, 0.0, 0.4], [[0.8, 0.0, 0.4]]) == 11
     assert free.along_rays([3.0, 0.0, 0.5], [[-3.0, 0.0, 0.5]]) == 41
     assert free.along_rays([3.0, 0.0, 0.5], [[1.2, 0.0, 0.5], [3.0, 9.0, 0.5]]) == 0
 
 
-def test_random_rays_mark_what_they_meet_and_nothing_far_from_them() -> None:
+def test_random_rays_mark_what_they_meet_and_nothing_far_from_them():
     stream = np.random.default_rng(0)
     for _ in range(60):
         a, b = stream.uniform([0.5, -0.4, 0.2], [1.3, 0.4, 0.8], (2, 3))
@@ -96,7 +93,7 @@ def test_random_rays_mark_what_they_meet_and_nothing_far_from_them() -> None:
         assert np.sqrt((off**2).sum(axis=1)).max(initial=0.0) <= np.sqrt(3.0) / 2.0 * SPACING
 
 
-def test_rays_may_have_an_origin_each() -> None:
+def test_rays_may_have_an_origin_each():
     stream = np.random.default_rng(1)
     origins, ends = stream.uniform([0.5, -0.4, 0.2], [1.3, 0.4, 0.8], (2, 20, 3))
     together, one_by_one = grid(), grid()
@@ -107,7 +104,7 @@ def test_rays_may_have_an_origin_each() -> None:
     np.testing.assert_array_equal(together.new(), one_by_one.new())
 
 
-def test_points_are_in_the_voxels_of_the_lattice() -> None:
+def test_points_are_in_the_voxels_of_the_lattice():
     stream = np.random.default_rng(2)
     points = stream.uniform([0.7, -0.2, 0.31], [1.1, 0.2, 0.6], (500, 3))
     points[:50] = np.rint(points[:50] * 200.0) / 200.0  # on faces, edges and corners
@@ -119,7 +116,7 @@ def test_points_are_in_the_voxels_of_the_lattice() -> None:
     assert free.new().shape == (0, 3)
 
 
-def test_an_image_is_the_rays_of_its_pixels(image: tuple[FloatArray, BoolArray]) -> None:
+def test_an_image_is_the_rays_of_its_pixels(image):
     depth, mask = image
     by_image, by_rays = grid(), grid()
     fresh = by_image.from_depth(depth, CAMERA, POSE, mask, fraction=0.9)
@@ -129,9 +126,7 @@ def test_an_image_is_the_rays_of_its_pixels(image: tuple[FloatArray, BoolArray])
     np.testing.assert_array_equal(by_image.new(), by_rays.new())
 
 
-def test_the_number_of_threads_changes_nothing(
-    threads: int, image: tuple[FloatArray, BoolArray], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_number_of_threads_changes_nothing(threads, image, monkeypatch):
     depth, mask = image
     alone = grid()
     before = torch.get_num_threads()
@@ -148,9 +143,7 @@ def test_the_number_of_threads_changes_nothing(
     np.testing.assert_array_equal(free.new(), alone.new())
 
 
-def test_scaled_images_are_points_on_the_rays_with_gaps_between(
-    image: tuple[FloatArray, BoolArray],
-) -> None:
+def test_scaled_images_are_points_on_the_rays_with_gaps_between(image):
     depth, mask = image
     scaled, traversed = grid(), grid()
     fresh = scaled.scaled_images(depth, CAMERA, POSE, mask)
@@ -164,7 +157,7 @@ def test_scaled_images_are_points_on_the_rays_with_gaps_between(
     assert found < voxels(traversed.new())
 
 
-def test_voxels_are_free_once_enough_views_saw_them() -> None:
+def test_voxels_are_free_once_enough_views_saw_them():
     free = grid(views=3)
     eye = [0.0, 0.0, 0.4]
     near, far = [[0.8, 0.0, 0.4]] * 5, [[0.9, 0.0, 0.4]]
@@ -176,7 +169,7 @@ def test_voxels_are_free_once_enough_views_saw_them() -> None:
     assert len(free.new()) == free.count - 11 == 11
 
 
-def test_a_grid_too_large_is_refused_with_both_numbers() -> None:
+def test_a_grid_too_large_is_refused_with_both_numbers():
     with pytest.raises(SettingError, match=r"0\.4 x 0\.4 x 0\.29 m .* 4\.644e\+10 .*200_000_000"):
         FreeGrid(WORKSPACE, 0.0001)
     with pytest.raises(SettingError, match="inf voxels"):
@@ -185,7 +178,7 @@ def test_a_grid_too_large_is_refused_with_both_numbers() -> None:
         grid(views=251)
 
 
-def test_shapes_and_poses_that_do_not_fit_are_refused(image: tuple[FloatArray, BoolArray]) -> None:
+def test_shapes_and_poses_that_do_not_fit_are_refused(image):
     depth, mask = image
     free = grid()
     with pytest.raises(PointsError, match=r"depth has shape \(64, 48\); accepted: \(48, 64\)"):
@@ -209,7 +202,7 @@ Place = tuple[float, float, float]
 Voxel = tuple[int, ...]
 
 
-def marked(a: Place, b: Place) -> set[Voxel]:
+def marked(a, b):
     met = np.zeros(COUNTS, dtype=np.uint8)
     grid = MarkedVoxels(met.reshape(-1), COUNTS, LOWER, 1.0)
     mark_segments(grid, np.array([a]), np.array([b]), 0, 1)
@@ -217,7 +210,7 @@ def marked(a: Place, b: Place) -> set[Voxel]:
     return {tuple(voxel) for voxel in np.argwhere(met).tolist()}
 
 
-def overlap(voxel: Voxel, a: Place, b: Place) -> tuple[Fraction, bool]:
+def overlap(voxel, a, b):
     """How much of the segment is in the voxel with its faces (below 0: none), and whether within
     it alone: not in a face that it shares with the next lower voxel."""
     enters, leaves, within = Fraction(0), Fraction(1), True
@@ -235,9 +228,7 @@ def overlap(voxel: Voxel, a: Place, b: Place) -> tuple[Fraction, bool]:
 
 @settings(max_examples=150, deadline=None)
 @given(a=places, b=places)
-def test_all_voxels_that_are_passed_are_marked_and_none_that_is_not_touched(
-    a: Place, b: Place
-) -> None:
+def test_all_voxels_that_are_passed_are_marked_and_none_that_is_not_touched(a, b):
     found = marked(a, b)
     for voxel in np.ndindex(*COUNTS):
         inside, within = overlap(voxel, a, b)
@@ -249,7 +240,7 @@ def test_all_voxels_that_are_passed_are_marked_and_none_that_is_not_touched(
 
 @settings(max_examples=150, deadline=None)
 @given(a=places, b=places)
-def test_the_voxels_of_ends_inside_are_marked_and_all_are_joined(a: Place, b: Place) -> None:
+def test_the_voxels_of_ends_inside_are_marked_and_all_are_joined(a, b):
     found = marked(a, b)
     for end in (a, b):
         inside = all(0.0 < x < count for x, count in zip(end, COUNTS, strict=True))
@@ -260,23 +251,23 @@ def test_the_voxels_of_ends_inside_are_marked_and_all_are_joined(a: Place, b: Pl
     assert steps.max(initial=0) <= 1
 
 
-def test_equal_crossings_lead_over_edges_and_corners() -> None:
+def test_equal_crossings_lead_over_edges_and_corners():
     assert marked((0.5, 0.5, 0.5), (2.5, 2.5, 2.5)) == {(0, 0, 0), (1, 1, 1), (2, 2, 2)}
     assert marked((2.5, 0.5, 0.25), (0.5, 2.5, 0.25)) == {(2, 0, 0), (1, 1, 0), (0, 2, 0)}
 
 
-def test_a_way_within_a_face_is_in_the_upper_voxels() -> None:
+def test_a_way_within_a_face_is_in_the_upper_voxels():
     assert marked((0.5, 2.0, 0.5), (2.5, 2.0, 0.5)) == {(0, 2, 0), (1, 2, 0), (2, 2, 0)}
     assert marked((2.5, 2.0, 1.0), (0.5, 2.0, 1.0)) == {(0, 2, 1), (1, 2, 1), (2, 2, 1)}
     assert marked((0.5, 4.0, 0.5), (2.5, 4.0, 0.5)) == set()  # there is no upper one
 
 
-def test_what_a_way_only_touches_from_outside_is_not_marked() -> None:
+def test_what_a_way_only_touches_from_outside_is_not_marked():
     assert marked((-1.0, 1.0, 0.5), (1.0, -1.0, 0.5)) == set()
     assert marked((6.0, 1.5, 0.5), (5.0, 1.5, 0.5)) == set()
 
 
-def test_numbers_next_to_faces_and_of_no_size_do_no_harm() -> None:
+def test_numbers_next_to_faces_and_of_no_size_do_no_harm():
     below, tiny = float(np.nextafter(2.0, 0.0)), 5e-324
     assert marked((below, 1.0, 1.0), (2.0, 1.0, 1.0)) == {(1, 1, 1), (2, 1, 1)}
     assert marked((0.0, 0.0, 0.0), (tiny, -tiny, 0.0)) == {(0, 0, 0)}
@@ -290,11 +281,11 @@ AROUND = Workspace((-0.2, -0.2, -0.1), (0.3, 0.2, 0.1))
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def turns(angles: FloatArray) -> FloatArray:
+def turns(angles):
     return axis_angle(np.tile(UP, (len(angles), 1)), angles)
 
 
-def distance_to_box(points: FloatArray, poses: FloatArray) -> FloatArray:
+def distance_to_box(points, poses):
     """Signed distance (N,) to the union of the box at poses (P, 4, 4), from outside exact."""
     best = np.full(len(points), np.inf)
     for box_from_world in inverse(poses):
@@ -302,7 +293,7 @@ def distance_to_box(points: FloatArray, poses: FloatArray) -> FloatArray:
     return best
 
 
-def test_nodes_of_a_box_are_around_its_middle_and_off_its_faces() -> None:
+def test_nodes_of_a_box_are_around_its_middle_and_off_its_faces():
     box = trimesh.creation.box(SIZE)
     box.apply_translation([0.3, 0.2, 0.1])
     nodes = interior_lattice(box, 0.01)
@@ -311,7 +302,7 @@ def test_nodes_of_a_box_are_around_its_middle_and_off_its_faces() -> None:
     assert (np.abs(nodes - [0.3, 0.2, 0.1]) < 0.5 * SIZE - 1e-3).all()
 
 
-def test_thin_parts_have_nodes_and_several_solids_add_up() -> None:
+def test_thin_parts_have_nodes_and_several_solids_add_up():
     plate = trimesh.creation.box((0.1, 0.1, 0.001))
     ball = trimesh.creation.icosphere(radius=0.03)
     ball.apply_translation([0.5, 0.0, 0.0])
@@ -323,12 +314,12 @@ def test_thin_parts_have_nodes_and_several_solids_add_up() -> None:
     assert interior_lattice([], 0.01).shape == (0, 3)
 
 
-def test_a_spacing_that_makes_too_many_nodes_is_refused() -> None:
+def test_a_spacing_that_makes_too_many_nodes_is_refused():
     with pytest.raises(SettingError, match=r"spacing is 1e-05 m.*2_000_000"):
         interior_lattice(trimesh.creation.box(SIZE), 1e-5)
 
 
-def test_nothing_moves_further_than_a_step_and_all_poses_lie_near_the_way() -> None:
+def test_nothing_moves_further_than_a_step_and_all_poses_lie_near_the_way():
     stream = np.random.default_rng(0)
     poses = random_poses(stream, 6, 0.2)
     way = poses_between(poses, step=0.005, radius=0.1)
@@ -342,7 +333,7 @@ def test_nothing_moves_further_than_a_step_and_all_poses_lie_near_the_way() -> N
         assert np.abs(way - pose).max(axis=(1, 2)).min() == 0.0
 
 
-def test_poses_that_hardly_move_are_thinned() -> None:
+def test_poses_that_hardly_move_are_thinned():
     poses = np.tile(np.eye(4), (5001, 1, 1))
     poses[:, 0, 3] = np.linspace(0.0, 0.1, 5001)
     way = poses_between(poses, step=0.01, radius=0.2)
@@ -354,7 +345,7 @@ def test_poses_that_hardly_move_are_thinned() -> None:
     assert len(poses_between(np.zeros((0, 4, 4)), step=0.01, radius=0.2)) == 0
 
 
-def test_poses_too_far_apart_are_refused() -> None:
+def test_poses_too_far_apart_are_refused():
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 1e9
     with pytest.raises(PoseError, match=r"1e\+09 m.*accepted: at most 1_000_000"):
@@ -364,7 +355,7 @@ def test_poses_too_far_apart_are_refused() -> None:
 
 
 @pytest.mark.parametrize("turned", [0.0, 1.3, 3.0])
-def test_a_box_that_moves_and_turns_frees_the_voxels_it_passes(turned: float) -> None:
+def test_a_box_that_moves_and_turns_frees_the_voxels_it_passes(turned):
     given = compose(
         turns(np.array([0.2, 0.2 + turned])), np.array([[-0.1, 0.0, 0], [0.2, 0.05, 0]])
     )
