@@ -1,6 +1,7 @@
-"""Grids, poses and results that tests share."""
+"""Grids, poses, results, and the files of kernels that tests share."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 
@@ -8,6 +9,14 @@ from chsel.problem.noise import EXTENT, INDEPENDENT, LATER, SHARE
 from chsel.problem.poses import apply, compose, random_rotations
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.sdf_grid import SdfGrid
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def kernel_files():
+    """The files of `chsel` that import the compiler of kernels."""
+    files = (REPOSITORY / "chsel").rglob("*.py")
+    return sorted(file for file in files if "from chsel.numerics.compiler" in file.read_text())
 
 
 def ball_grid(radius, resolution, half):

@@ -25,8 +25,7 @@ from chsel.qd.archive import GridArchive
 from chsel.qd.measures import MEASURES
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
-from tests.chsel.kernel_files import kernel_files
-from tests.chsel.samples import hypotheses_at
+from tests.chsel.samples import hypotheses_at, kernel_files
 from tests.determinism.cases import CASES
 from tests.determinism.decisions import decision_stages
 from tests.determinism.libraries import fused as contracted

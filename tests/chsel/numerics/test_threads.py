@@ -14,7 +14,7 @@ import torch
 import chsel
 from chsel.errors import EngineError, SettingError
 from chsel.numerics import threads as numerics_threads
-from chsel.numerics.threads import parallel_for, require_ieee_arithmetic, require_threads
+from chsel.numerics.threads import parallel_for, require_ieee_arithmetic
 from chsel.numerics.threads import threads as use_threads
 from tests.chsel.samples import ball_grid
 
@@ -36,12 +36,10 @@ def no_scratch():
     return None
 
 
-@pytest.mark.parametrize("least", [1, 3])
-@pytest.mark.parametrize("multiple", [1, 8])
-@pytest.mark.parametrize("count", [0, 1, 2, 3, 7, 8, 9, 100, 1001])
+@pytest.mark.parametrize(("multiple", "least"), [(1, 1), (8, 1), (1, 3)])
+@pytest.mark.parametrize("count", [0, 1, 3, 8, 9, 1001])
 def test_pieces_cover_the_range_once(threads, count, multiple, least):
-    done = []
-    starts = []
+    done, starts = [], []
 
     def run(first, last, _):
         starts.append(first)
@@ -52,14 +50,11 @@ def test_pieces_cover_the_range_once(threads, count, multiple, least):
     assert all(first % multiple == 0 for first in starts)
 
 
-@pytest.mark.parametrize("count", [0, -1, 257, 10_000, 1.0, True])
+@pytest.mark.parametrize("count", [0, 257, 1.0, True])
 def test_a_number_of_threads_that_cannot_be_meant_is_refused(count):
-    with (
-        pytest.raises(SettingError, match=rf"threads is {count}; accepted: .* from 1 to 256"),
-        use_threads(count),
-    ):
+    message = rf"threads is {count}; accepted: .* from 1 to 256"
+    with pytest.raises(SettingError, match=message), use_threads(count):
         pass
-    require_threads("threads", 256)
 
 
 SETTINGS = """
@@ -87,8 +82,7 @@ def test_the_number_of_threads_is_what_was_set_or_that_of_torch_or_openmp():
 
 def test_every_thread_works_in_scratch_of_its_own(threads):
     """No thread goes on before all have begun."""
-    begun = threading.Barrier(threads)
-    used = {}
+    begun, used, kept = threading.Barrier(threads), {}, []
 
     def run(first, last, own):
         if threading.get_ident() not in used:
@@ -96,10 +90,8 @@ def test_every_thread_works_in_scratch_of_its_own(threads):
             begun.wait()
         used[threading.get_ident()].add(id(own))
 
-    kept = []
     parallel_for(run, 200, lambda: kept.append(object()) or kept[-1])
-    assert len(used) == threads
-    assert all(len(own) == 1 for own in used.values())
+    assert [len(own) for own in used.values()] == [1] * threads
     assert len(set.union(*used.values())) == threads
 
 
@@ -128,16 +120,15 @@ def test_work_may_spread_work(threads):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="threads inherit their rounding on Linux")
-def test_arithmetic_that_flushes_subnormals_is_refused(threads):
+def test_arithmetic_that_flushes_subnormals_is_refused():
     """A thread starts with the rounding of the thread that starts it."""
     if not torch.set_flush_denormal(True):
         pytest.skip("this processor cannot flush subnormal numbers")
     try:
         with pytest.raises(EngineError, match="flushes subnormal numbers to zero"):
             require_ieee_arithmetic()
-        if threads > 1:
-            with pytest.raises(EngineError, match="flushes subnormal numbers to zero"):
-                parallel_for(lambda first, last, _: None, 100, no_scratch)
+        with pytest.raises(EngineError, match="flushes subnormal"), use_threads(2):
+            parallel_for(lambda first, last, _: None, 100, no_scratch)
     finally:
         torch.set_flush_denormal(False)
 
@@ -149,14 +140,14 @@ def register():
 
 
 @pytest.mark.skipif(not MODES or platform.system() != "Linux", reason="fesetround's values differ")
-@pytest.mark.parametrize("act", [require_ieee_arithmetic, register])
-@pytest.mark.parametrize("mode", ["down", "up", "towards zero"])
-def test_nothing_runs_with_another_rounding(mode, act):
-    act()
+@pytest.mark.parametrize("mode", MODES)
+def test_nothing_runs_with_another_rounding(mode):
     library = ctypes.CDLL(None)
-    assert library.fesetround(MODES[mode]) == 0
-    try:
-        with pytest.raises(EngineError, match="does not round to the nearest number"):
-            act()
-    finally:
-        library.fesetround(NEAREST)
+    for act in (require_ieee_arithmetic, register):
+        act()
+        assert library.fesetround(MODES[mode]) == 0
+        try:
+            with pytest.raises(EngineError, match="does not round to the nearest number"):
+                act()
+        finally:
+            library.fesetround(NEAREST)

@@ -18,26 +18,22 @@ from tests.chsel.samples import plain_energy
 SENSOR = 0.0005
 
 
-@pytest.mark.parametrize("sigma", [0.001, 0.006])
-@pytest.mark.parametrize("foreign", [0, 60])
+@pytest.mark.parametrize(("sigma", "foreign"), [(0.001, 0), (0.006, 60)])
 def test_many_distances_tell_the_noise_and_the_share_of_outliers(sigma, foreign):
     random = np.random.default_rng(3)
     distances = np.concatenate([random.normal(0.0, sigma, 600), random.uniform(0.05, 0.2, foreign)])
     noise = estimate_noise(random.permutation(distances), SENSOR)
     assert noise.sigma == pytest.approx(sigma, rel=0.06)
     assert noise.outliers == pytest.approx(foreign / len(distances), abs=0.003)
+    assert estimate_noise(-distances[::-1], SENSOR) == noise  # neither order nor sign matters
 
 
-@pytest.mark.parametrize("count", [0, 1, 3, 6])
-def test_few_distances_that_a_fit_makes_small_leave_the_noise_of_the_sensor(count):
+@pytest.mark.parametrize("count", [0, 1, 6, 100])
+def test_distances_that_a_fit_makes_small_leave_the_noise_of_the_sensor(count):
     noise = estimate_noise(np.full(count, 1e-5), SENSOR)
-    assert noise.sigma == pytest.approx(SENSOR, rel=1e-3)
+    assert SENSOR <= noise.sigma < 1.001 * SENSOR
     expected = PRIOR_CONTACTS * PRIOR_OUTLIERS / (PRIOR_CONTACTS + count)
     assert noise.outliers == pytest.approx(expected)
-
-
-def test_it_is_never_less_than_the_sensor_s():
-    assert estimate_noise(np.full(100, 1e-6), SENSOR).sigma == SENSOR
 
 
 def test_one_contact_far_off_among_five_is_an_outlier():
@@ -45,11 +41,6 @@ def test_one_contact_far_off_among_five_is_an_outlier():
     noise = estimate_noise(distances, SENSOR)
     assert noise.sigma < 2.0 * SENSOR
     assert noise.outliers == pytest.approx((1.0 + PRIOR_CONTACTS * PRIOR_OUTLIERS) / 9.0)
-
-
-def test_neither_order_nor_sign_matters():
-    distances = np.random.default_rng(1).normal(0.0, 0.003, 40)
-    assert estimate_noise(distances, SENSOR) == estimate_noise(-distances[::-1], SENSOR)
 
 
 @pytest.mark.parametrize(("known", "shared"), [(0, 0.0), (3, 0.0), (12, 0.004), (50, 0.0)])
@@ -69,8 +60,8 @@ def test_levels_of_noise_are_those_of_the_sensor_and_of_all_else():
     assert sum(one.weights) == pytest.approx(1.0)
     squares = np.square(other.sigmas) - np.square(one.sigmas)
     np.testing.assert_allclose(squares, 0.003**2)
-    logs = np.log(one.sigmas)
-    np.testing.assert_allclose(np.diff(logs), np.diff(logs)[0])
+    ratios = np.diff(np.log(one.sigmas))
+    np.testing.assert_allclose(ratios, ratios[0])
     assert one.sigmas[0] < 0.001 < 0.005 < one.sigmas[-1]
 
 
@@ -88,6 +79,5 @@ def test_wrong_points_cost_a_bounded_amount_and_later_ones_less():
 def test_many_alike_points_count_as_few():
     noise, count = noise_model(SENSOR), int(INDEPENDENT)
     rows = np.random.default_rng(2).normal(0.0, 0.003, (4, count))
-    once = noise.energies(rows, np.zeros((4, 0)))
-    many = noise.energies(np.tile(rows, (1, 7)), np.zeros((4, 0)))
+    once, many = (noise.energies(np.tile(rows, (1, n)), np.zeros((4, 0))) for n in (1, 7))
     np.testing.assert_allclose(many, once, rtol=1e-9)

@@ -31,14 +31,12 @@ def test_transforms_that_are_not_rigid_are_named():
 
 def test_quaternions_and_rotations_are_each_others_inverse():
     r = random_rotations(np.random.default_rng(0), 100)
-    axes = np.eye(3)
-    r = np.concatenate([r, np.eye(3)[None], axis_angle(axes, np.full(3, np.pi))])
+    r = np.concatenate([r, np.eye(3)[None], axis_angle(np.eye(3), np.full(3, np.pi))])
     np.testing.assert_allclose(rotation_matrices(quaternions(r)), r, atol=1e-14)
 
 
 def test_turns_are_those_of_scipy_and_positions_on_a_line():
-    stream = np.random.default_rng(1)
-    first, second = random_rotations(stream, 2)
+    first, second = random_rotations(np.random.default_rng(1), 2)
     t = np.array([0.0, 0.1, 0.5, 0.9, 1.0])
     ends = np.tile(compose(first, np.array([1.0, 2.0, 3.0])), (5, 1, 1))
     others = np.tile(compose(second, np.array([2.0, 0.0, 3.0])), (5, 1, 1))
@@ -48,15 +46,15 @@ def test_turns_are_those_of_scipy_and_positions_on_a_line():
     np.testing.assert_allclose(between[:, :3, 3], [[1 + s, 2 - 2 * s, 3] for s in t], atol=1e-15)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 1.0, 3.1, np.pi])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, np.pi])
 def test_half_of_a_turn_is_half_its_angle(angle):
-    start = compose(random_rotations(np.random.default_rng(2), 1), np.zeros((1, 3)))
+    rotation = random_rotations(np.random.default_rng(2), 1)[0]
     axis = np.array([0.6, 0.0, 0.8])
-    turned, half = start.copy(), start.copy()
-    turned[0, :3, :3] = axis_angle(axis, angle) @ start[0, :3, :3]
-    half[0, :3, :3] = axis_angle(axis, 0.5 * angle) @ start[0, :3, :3]
+    start, half, turned = (
+        compose(axis_angle(axis, part * angle) @ rotation, np.zeros(3))[None]
+        for part in (0.0, 0.5, 1.0)
+    )
     found = interpolated(start, turned, np.array([0.5]))
     if angle == np.pi:  # either way round is as short
-        found = interpolated(found, turned, np.array([1.0]))
-        half = turned
+        found, half = interpolated(found, turned, np.array([1.0])), turned
     np.testing.assert_allclose(found, half, atol=1e-12)

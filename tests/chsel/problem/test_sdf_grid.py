@@ -9,50 +9,40 @@ from chsel.errors import MeshError, MeshWarning, SdfError, SettingError
 from chsel.problem import defaults
 from chsel.problem.defaults import object_grid
 from chsel.problem.mesh import load_mesh
-from chsel.problem.sdf_grid import DEFAULT_NODES, _default_spacing, _shape, mesh_sdf
+from chsel.problem.sdf_grid import DEFAULT_NODES, _default_spacing, mesh_sdf
 from chsel.problem.surface import surface_points
 from tests.chsel.samples import box_distance
 
 SIZE = np.array([0.2, 0.12, 0.08])
+BOX = trimesh.creation.box(SIZE)
 
 
 @pytest.fixture(scope="module")
-def box():
-    return trimesh.creation.box(SIZE)
+def grid():
+    return SdfGrid.from_mesh(BOX, 0.01)
 
 
-@pytest.fixture(scope="module")
-def grid(box):
-    return SdfGrid.from_mesh(box, 0.01)
+def nodes_of(grid):
+    return grid.origin + np.indices(grid.shape).reshape(3, -1).T * grid.resolution
 
 
-def box_sdf(points):
-    return box_distance(points, SIZE)
-
-
-def test_distance_to_a_box_has_its_closed_form(box):
+def test_distance_to_a_box_has_its_closed_form():
     points = np.random.default_rng(0).uniform(-0.2, 0.2, (3000, 3))
-    sdf, gradient = mesh_sdf(box, points)
-    np.testing.assert_allclose(sdf, box_sdf(points), atol=1e-12)
+    sdf, gradient = mesh_sdf(BOX, points)
+    np.testing.assert_allclose(sdf, box_distance(points, SIZE), atol=1e-12)
     np.testing.assert_allclose((gradient**2).sum(axis=1), 1.0, atol=1e-12)
     away = np.abs(sdf) > 2e-3
-    ahead = box_sdf(points + 1e-7 * gradient)
+    ahead = box_distance(points + 1e-7 * gradient, SIZE)
     np.testing.assert_allclose((ahead - sdf)[away], 1e-7, rtol=1e-3)
 
 
-def test_an_open_mesh_gets_its_sign_from_the_winding_number(box):
-    opened = trimesh.Trimesh(box.vertices, box.faces[:-1], process=False)
-    assert not opened.is_watertight
+def test_an_open_mesh_gets_its_sign_from_the_winding_number():
+    opened = trimesh.Trimesh(BOX.vertices, BOX.faces[:-1], process=False)
     sdf, _ = mesh_sdf(opened, np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.0, 0.3]]))
-    assert sdf[0] < 0
-    assert (sdf[1:] > 0).all()
+    assert np.sign(sdf).tolist() == [-1.0, 1.0, 1.0]
 
 
-SCANS = ("003_cracker_box", "006_mustard_bottle", "010_potted_meat_can")
-SCANS += ("035_power_drill", "048_hammer", "050_medium_clamp")
-
-
-@pytest.mark.parametrize("name", SCANS)
+@pytest.mark.parametrize("name", ["006_mustard_bottle", "048_hammer"])
 def test_the_sign_changes_nowhere_but_at_the_surface(ycb_directory, name):
     """From a node further from the surface than the next node, no step leads through it.
 
@@ -69,63 +59,35 @@ def test_the_sign_changes_nowhere_but_at_the_surface(ycb_directory, name):
     assert volume == pytest.approx(mesh.volume, rel=0.1)
 
 
-@pytest.mark.parametrize("mesh", ["box.obj", None, trimesh.Scene(), trimesh.Trimesh()])
-def test_a_grid_of_no_mesh_is_refused(mesh):
-    with pytest.raises(MeshError, match=r"mesh is .*; accepted: a Trimesh with faces"):
-        SdfGrid.from_mesh(mesh)
-
-
-def test_a_grid_made_in_parts_has_the_same_bits_and_says_how_far_it_is(box, grid, monkeypatch):
-    told = []
-    nodes = grid.values.size
-
-    def remade(mesh=box):
-        told.clear()
-        return SdfGrid.from_mesh(mesh, 0.01, progress=lambda *counts: told.append(counts))
-
-    assert remade().digest == grid.digest
-    assert told == [(0, nodes)]
+def test_a_grid_made_in_parts_has_the_same_bits_and_says_how_far_it_is(grid, monkeypatch):
+    told, nodes = [], grid.values.size
     monkeypatch.setattr("chsel.problem.sdf_grid._PART_NODES", 1000)
-    assert remade().digest == grid.digest
+    made = SdfGrid.from_mesh(BOX, 0.01, progress=lambda *counts: told.append(counts))
+    assert made.digest == grid.digest
     assert told == [(done, nodes) for done in range(0, nodes, 1000)]
-    monkeypatch.setattr("chsel.problem.sdf_grid._PART_NODES", 1)
-    remade(
-        box.subdivide().subdivide().subdivide().subdivide()
-    )  # of a mesh of 3072 faces, parts are larger
-    assert told == [(done, nodes) for done in range(0, nodes, 3072 // 5)]
 
 
-@pytest.mark.parametrize(
-    ("size", "tilt"),
-    [
-        ((0.1, 0.06, 0.0006), 0.0),
-        ((0.1, 0.06, 0.0006), 0.03),
-        ((0.2, 0.12, 0.0006), 0.0),
-        ((0.18, 0.09, 0.015), 0.03),
-    ],
-)
-def test_the_default_grid_of_a_thin_object_is_small_and_has_two_nodes_across(size, tilt):
-    plate = trimesh.creation.box(size)
+@pytest.mark.parametrize(("thickness", "tilt"), [(0.0006, 0.0), (0.015, 0.03)])
+def test_the_default_grid_of_a_thin_object_is_small_and_has_two_nodes_across(thickness, tilt):
+    plate = trimesh.creation.box((0.18, 0.09, thickness))
     plate.apply_transform(trimesh.transformations.rotation_matrix(tilt, [1.0, 2.0, 0.0]))
     with pytest.warns(MeshWarning, match=r"mm has nodes [0-9.]+ mm apart and a padding"):
         spacing, padding = _default_spacing(plate, 0.05)
     nodes = np.prod((np.asarray(plate.extents) + 2.0 * padding) / spacing + 1.0)
     assert 0.7 * DEFAULT_NODES < nodes <= 1.1 * DEFAULT_NODES
-    assert np.prod(_shape(plate, spacing, padding)) <= DEFAULT_NODES
-    assert spacing <= size[2] / 2.0
+    assert spacing <= thickness / 2.0
 
 
 def test_a_thin_plate_has_its_distance_in_a_grid_of_few_nodes(monkeypatch):
     monkeypatch.setattr("chsel.problem.sdf_grid.DEFAULT_NODES", 20_000)
     size = np.array([0.1, 0.06, 0.003])
-    plate = trimesh.creation.box(size)
     with pytest.warns(MeshWarning, match=r"100 x 60 x 3 mm .* 0.15 mm would take") as caught:
-        grid = SdfGrid.from_mesh(plate)
+        grid = SdfGrid.from_mesh(trimesh.creation.box(size))
     assert len(caught) == 1
     assert grid.values.size <= 20_000
     assert (grid.values < 0.0).sum(axis=2).max() == 2
-    nodes = grid.origin + np.indices(grid.shape).reshape(3, -1).T * grid.resolution
-    np.testing.assert_allclose(grid.values.reshape(-1), box_distance(nodes, size), atol=1e-8)
+    expected = box_distance(nodes_of(grid), size)
+    np.testing.assert_allclose(grid.values.reshape(-1), expected, atol=1e-8)
     points = np.random.default_rng(0).uniform(-0.6 * size, 0.6 * size, (3000, 3))
     distance = grid.at(points, lookup="trilinear")[0]
     np.testing.assert_allclose(distance, box_distance(points, size), atol=grid.resolution / 2.0)
@@ -133,28 +95,25 @@ def test_a_thin_plate_has_its_distance_in_a_grid_of_few_nodes(monkeypatch):
     assert np.abs(box_distance(on_it, size)).max() < grid.resolution / 2.0
 
 
-def test_a_mesh_has_one_default_grid_which_is_kept_while_there_is_room(box, monkeypatch):
-    grid = object_grid(box)
+def test_a_mesh_has_one_default_grid_which_is_kept_while_there_is_room(monkeypatch):
+    grid = object_grid(BOX)
     assert grid.resolution == SIZE.min() / 20.0
-    assert SdfGrid.from_mesh(box).digest == grid.digest
-    assert object_grid(box.copy()) is grid
-    assert object_grid(box, 0.01) is not grid
-    assert object_grid(box.copy().apply_scale(0.9)) is not grid
-    assert object_grid(box) is grid
+    assert grid.values.size <= DEFAULT_NODES
+    assert SdfGrid.from_mesh(BOX).digest == grid.digest
+    assert object_grid(BOX.copy()) is grid
+    assert object_grid(BOX, 0.01) is not grid
+    assert object_grid(BOX.copy().apply_scale(0.9)) is not grid
     monkeypatch.setattr("chsel.problem.defaults._KEPT_NODES", grid.values.size)
-    assert object_grid(box) is grid  # the last used, so that the others are gone
+    assert object_grid(BOX) is grid  # the last used, so that the others are gone
     assert list(defaults._kept.values()) == [grid]
-    monkeypatch.setattr("chsel.problem.defaults._KEPT_NODES", grid.values.size - 1)
-    assert object_grid(box) is grid
-    assert not defaults._kept
 
 
 def test_the_grid_covers_the_padded_box_and_holds_the_distance(grid):
     lower, upper = grid.bounds
     assert (lower <= -SIZE / 2 - 0.05 + 1e-12).all()
     assert (upper >= SIZE / 2 + 0.05 - 1e-12).all()
-    nodes = grid.origin + np.indices(grid.shape).reshape(3, -1).T * grid.resolution
-    np.testing.assert_allclose(grid.values.reshape(-1), box_sdf(nodes), atol=1e-8)
+    expected = box_distance(nodes_of(grid), SIZE)
+    np.testing.assert_allclose(grid.values.reshape(-1), expected, atol=1e-8)
 
 
 def test_nearest_lookup_reads_the_nearest_node(grid):
@@ -182,7 +141,7 @@ def test_trilinear_lookup_is_exact_for_a_linear_field():
 def test_beyond_the_grid_the_distance_stays_close_to_the_true_one(grid, lookup):
     points = np.random.default_rng(3).uniform(-2.0, 2.0, (2000, 3))
     sdf, gradient = grid.at(points, lookup=lookup, outside="surface_point")
-    true = box_sdf(points)
+    true = box_distance(points, SIZE)
     far = true > 0.2
     assert far.sum() > 1500
     assert (sdf[far] > true[far] - 0.01).all()
@@ -191,8 +150,7 @@ def test_beyond_the_grid_the_distance_stays_close_to_the_true_one(grid, lookup):
 
 
 def test_bounding_box_distance_is_that_to_the_grid(grid):
-    _, upper = grid.bounds
-    sdf, gradient = grid.at([[upper[0] + 0.3, 0.0, 0.0]], outside="bounding_box")
+    sdf, gradient = grid.at([[grid.bounds[1][0] + 0.3, 0.0, 0.0]], outside="bounding_box")
     assert float(sdf[0]) == pytest.approx(0.3)
     np.testing.assert_allclose(gradient, [[1.0, 0.0, 0.0]])
 
@@ -211,19 +169,21 @@ def test_active_cells_are_those_that_read_a_value_below_the_level(grid, lookup):
     assert 0.01 < flags.mean() < 0.3
 
 
-def test_grids_that_make_no_sense_are_refused(grid, box):
-    with pytest.raises(SdfError, match="border"):
-        SdfGrid(grid.origin, 0.01, grid.values[10:], grid.gradients[10:])
-    with pytest.raises(SdfError, match=r"SDF gradients has shape"):
-        SdfGrid(grid.origin, 0.01, grid.values, grid.gradients[1:])
-    with pytest.raises(SdfError, match="not finite"):
-        SdfGrid(
-            grid.origin, 0.01, np.where(grid.values < -0.03, np.nan, grid.values), grid.gradients
-        )
+def test_grids_that_make_no_sense_are_refused(grid):
+    spoiled = np.where(grid.values < -0.03, np.nan, grid.values)
+    for values, gradients, message in (
+        (grid.values[10:], grid.gradients[10:], "border"),
+        (grid.values, grid.gradients[1:], "SDF gradients has shape"),
+        (spoiled, grid.gradients, "not finite"),
+    ):
+        with pytest.raises(SdfError, match=message):
+            SdfGrid(grid.origin, 0.01, values, gradients)
+    with pytest.raises(MeshError, match=r"mesh is .*; accepted: a Trimesh with faces"):
+        SdfGrid.from_mesh("box.obj")
     with pytest.raises(MeshError, match="mesh is flat; accepted: a solid"):
-        SdfGrid.from_mesh(box.copy().apply_scale([1.0, 1.0, 0.0]))
+        SdfGrid.from_mesh(BOX.copy().apply_scale([1.0, 1.0, 0.0]))
     nodes = re.escape(f"{30_002 * 22_002 * 18_002:.3g}")
     with pytest.raises(SdfError, match=rf"1e-05 m needs {nodes} nodes; .* coarser resolution"):
-        SdfGrid.from_mesh(box, 1e-5)
+        SdfGrid.from_mesh(BOX, 1e-5)
     with pytest.raises(SettingError, match="SDF resolution is 0"):
-        SdfGrid.from_mesh(box, 0)
+        SdfGrid.from_mesh(BOX, 0)

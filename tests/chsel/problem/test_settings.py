@@ -1,9 +1,6 @@
 """Settings from mappings and back, and choices of installed packages by their entry points."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -28,11 +25,11 @@ from chsel.problem.settings import (
 )
 
 
-@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("method", METHODS)
-def test_every_preset_survives_the_way_through_a_mapping(method, preset):
-    settings = preset_settings(method, preset)
-    assert build_method(method, settings_mapping(settings)).settings == settings
+def test_every_preset_survives_the_way_through_a_mapping(method):
+    for preset in PRESETS:
+        settings = preset_settings(method, preset)
+        assert build_method(method, settings_mapping(settings)).settings == settings
 
 
 @pytest.mark.parametrize(
@@ -76,14 +73,11 @@ class Checked(CheckedSettings):
         ({"rate": 0.0}, "rate is 0.0; accepted: a finite number above 0"),
         ({"rate": float("nan")}, "rate is nan; accepted: a finite number above 0"),
         ({"rate": "x"}, "rate is 'x'; accepted: a finite number above 0"),
-        ({"rate": None}, "rate is None; accepted: a finite number above 0"),
         ({"count": -1}, "count is -1; accepted: a finite number of at least 0"),
         ({"count": 1_001}, "count is 1001; accepted: at most 1_000"),
         ({"length": 20.0}, r"length is 20.0; accepted: 0.001 to 10 (m)"),
         ({"length": float("nan")}, r"length is nan; accepted: 0.001 to 10 (m)"),
         ({"name": "c"}, "name is 'c'; accepted: a, b"),
-        ({"name": None}, "name is None; accepted: a, b"),
-        ({"limit": -1.0}, "limit is -1.0; accepted: a finite number above 0"),
         ({"limit": 6.0}, "limit is 6.0; accepted: at most 5.0"),
         ({"limit": 0.5}, "rate is 1.0; accepted: at most limit"),
         ({"limit": 0.5, "name": "c"}, "name is 'c'; accepted: a, b"),
@@ -100,12 +94,11 @@ def test_values_at_the_limits_and_none_pass_where_the_type_has_it():
     assert build_settings(Checked, {"limit": None, "rate": 2}, "settings") == Checked(rate=2.0)
     with pytest.raises(SettingError, match=r"^settings.count is None; accepted: an integer$"):
         build_settings(Checked, {"count": None}, "settings")
-    with pytest.raises(SettingError, match=r"^settings: limit is 0.0; accepted: a finite number"):
-        build_settings(Checked, {"limit": 0}, "settings")
 
 
 POLICY = """
 from dataclasses import dataclass
+from chsel.cost.cost_settings import CostSettings
 from chsel.policies.policy import ConfiguredPolicy, PolicySettings
 
 @dataclass(frozen=True)
@@ -119,31 +112,30 @@ class Plain:
     settings = MineSettings()
 
 class Unlike:
-    settings = {settings}
-    def decide(self, problem):
-        return None
+    settings = {}
+
+class Other:
+    settings = CostSettings()
 
 class Unready:
     def __init__(self):
         raise RuntimeError("no\\nlicence")
 """
-Install = Callable[..., NamedChoices]
 
 
 @pytest.fixture
 def install(tmp_path, monkeypatch):
     """Installs packages that each offer a policy, as pip does; the choices that there are then."""
 
-    def done(*lines, settings="{}"):
+    def done(*lines):
         module = f"offered_by_{tmp_path.name}"  # imported once in a process
         for number, line in enumerate(lines):
             about = tmp_path / f"mine{number}-1.dist-info"
             about.mkdir()
             (about / "METADATA").write_text(f"Name: mine{number}\nVersion: 1\n")
-            (about / "entry_points.txt").write_text(
-                f"[chsel.policies]\n{line.replace('mine:', module + ':')}\n"
-            )
-        (tmp_path / f"{module}.py").write_text(POLICY.replace("{settings}", settings))
+            entry = line.replace("mine:", f"{module}:")
+            (about / "entry_points.txt").write_text(f"[chsel.policies]\n{entry}\n")
+        (tmp_path / f"{module}.py").write_text(POLICY)
         monkeypatch.syspath_prepend(str(tmp_path))
         ours = {"grid": (ConfiguredPolicy, PolicySettings())}
         return NamedChoices("policy", "chsel.policies", "docs/page.md", ours, _lacks)
@@ -162,19 +154,18 @@ def test_a_choice_of_a_package_is_built_as_ours_are(install):
 
 
 @pytest.mark.parametrize(
-    ("lines", "settings", "message"),
+    ("lines", "message"),
     [
-        (["mine = mine:Nothing"], "{}", "policy mine of package mine0 cannot be loaded: Attribute"),
-        (["mine = mine:Unready"], "{}", "cannot be loaded: RuntimeError: no licence; accepted: a"),
-        (["mine = nowhere:Mine"], "{}", "cannot be loaded: ModuleNotFoundError"),
-        (["mine = mine:Unlike"], "{}", "has settings {}; accepted: a frozen dataclass"),
-        (["mine = mine:Unlike"], "__import__('chsel').CostSettings()", "one derived from Policy"),
-        (["mine = mine:Plain"], "{}", "has no `decide`; accepted: decide(problem); see docs/page"),
-        (["mine = mine:Mine"] * 2, "{}", "policy mine is of mine0 and mine1; accepted: one of"),
+        (["mine = mine:Unready"], "cannot be loaded: RuntimeError: no licence; accepted: a"),
+        (["mine = nowhere:Mine"], "policy mine of package mine0 cannot be loaded: ModuleNotFound"),
+        (["mine = mine:Unlike"], "has settings {}; accepted: a frozen dataclass"),
+        (["mine = mine:Other"], "one derived from Policy"),
+        (["mine = mine:Plain"], "has no `decide`; accepted: decide(problem); see docs/page"),
+        (["mine = mine:Mine"] * 2, "policy mine is of mine0 and mine1; accepted: one of"),
     ],
 )
-def test_what_cannot_be_taken_is_one_line(install, lines, settings, message):
-    choices = install(*lines, settings=settings)
+def test_what_cannot_be_taken_is_one_line(install, lines, message):
+    choices = install(*lines)
     with pytest.raises(SettingError) as caught:
         choices.entry("mine")
     assert message in str(caught.value)
