@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from chsel.errors import PointsError, SettingError
+from chsel.errors import SettingError
 from chsel.sensing.depth_camera import (
     PinholeCamera,
     depth_regions,
@@ -24,8 +24,7 @@ def test_points_project_back_onto_their_pixels():
     points = CAMERA.back_project(depth)
     np.testing.assert_array_equal(points[2, 3], [8.0, 1.0, 8.0])
     u, v = 2.0 * points[..., 0] / points[..., 2] + 1.0, 4.0 * points[..., 1] / points[..., 2] + 1.5
-    np.testing.assert_allclose(u, np.tile([0.0, 1.0, 2.0, 3.0], (3, 1)), atol=1e-12)
-    np.testing.assert_allclose(v, np.tile([[0.0], [1.0], [2.0]], (1, 4)), atol=1e-12)
+    np.testing.assert_allclose([v, u], np.indices((3, 4)), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -35,18 +34,12 @@ def test_points_project_back_onto_their_pixels():
         ((4, 3.5, 1.0, 1.0, 0.0, 0.0), "camera height is 3.5; accepted: a whole number"),
         ((4, 10**9, 1.0, 1.0, 0.0, 0.0), "camera height is 1000000000; accepted: at most 100_000"),
         ((4, 3, 0.0, 1.0, 0.0, 0.0), "camera fx is 0.0; accepted"),
-        ((4, 3, 1.0, float("nan"), 0.0, 0.0), "camera fy is nan; accepted"),
         ((4, 3, 1.0, 1.0, float("inf"), 0.0), "camera cx is inf; accepted: a finite number"),
     ],
 )
 def test_what_no_camera_has_is_refused(values, message):
     with pytest.raises(SettingError, match=message):
         PinholeCamera(*values)
-
-
-def test_an_image_of_another_size_is_refused():
-    with pytest.raises(PointsError, match=r"depth has shape \(4, 3\); accepted: \(3, 4\)"):
-        CAMERA.back_project(np.ones((4, 3)))
 
 
 def test_only_depths_within_the_range_are_valid():
@@ -56,37 +49,8 @@ def test_only_depths_within_the_range_are_valid():
     assert not valid_pixels(np.array([0.0, np.inf]), nearest=0.0, furthest=np.inf).any()
 
 
-def test_edges_are_both_sides_of_every_jump_between_valid_neighbours():
-    stream = np.random.default_rng(0)
-    depth = np.where(stream.random((12, 15)) < 0.1, 1.0, 0.5) + stream.uniform(0.0, 0.02, (12, 15))
-    depth[stream.random(depth.shape) < 0.2] = np.nan
-    valid = np.isfinite(depth) & (stream.random(depth.shape) < 0.9)
-    edges = occlusion_edges(depth, valid, 0.05)
-    assert 0 < edges.sum() < valid.sum()
-    for row, column in np.ndindex(depth.shape):
-        around = np.s_[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-        jumps = np.abs(depth[around] - depth[row, column])[valid[around]]
-        expected = valid[row, column] and bool((jumps > 0.05).any())
-        assert edges[row, column] == expected
-
-
-def test_a_slope_is_no_edge():
-    depth = np.tile(np.linspace(0.5, 1.5, 50), (20, 1))
-    assert not occlusion_edges(depth, np.ones(depth.shape, bool), 0.05).any()
-
-
-def test_a_longer_reach_looks_across_a_gap():
-    depth = np.full((5, 9), 0.5)
-    depth[:, 5:] = 1.0
-    valid = np.ones(depth.shape, dtype=bool)
-    valid[:, 4] = False
-    assert not occlusion_edges(depth, valid, 0.05).any()
-    across = occlusion_edges(depth, valid, 0.05, reach=2)
-    np.testing.assert_array_equal(np.flatnonzero(across.any(axis=0)), [3, 5])
-
-
-@pytest.mark.parametrize(("shape", "reach"), [((40, 57), 5), ((40, 57), 2), ((3, 4), 9)])
-def test_edges_are_those_of_the_filters_of_scipy(shape, reach):
+@pytest.mark.parametrize(("shape", "reach"), [((40, 57), 1), ((40, 57), 5), ((3, 4), 9)])
+def test_edges_are_both_sides_of_every_jump_between_valid_neighbours(shape, reach):
     stream = np.random.default_rng(reach)
     depth, valid = stream.random(shape), stream.random(shape) < 0.8
     depth[~valid] = np.nan
@@ -142,20 +106,19 @@ def test_pixels_that_do_not_count_are_in_no_region_and_connect_none():
 def test_small_regions_are_those_of_fewer_pixels():
     depth = np.full((40, 60), 0.6)
     depth[10:13, 10:13] = 0.9
-    for least, count in ((9, 0), (10, 9), (0, 0), (10**6, 40 * 60)):
+    for least, count in ((9, 0), (10, 9), (10**6, 40 * 60)):
         assert int(small_regions(regions(depth), least).sum()) == count
 
 
-@pytest.mark.parametrize("side", [1, 5, 9])
+@pytest.mark.parametrize("side", [1, 9])
 def test_rays_of_small_regions_end_at_the_least_depth_around(side):
     depth = np.full((40, 60), 0.6)
     depth[10 : 10 + side, 20 : 20 + side] = 0.9
     ends, small = speckle_free(depth, depth > 0.0, regions(depth), 100)
     assert small == side**2
     np.testing.assert_array_equal(ends, np.full((40, 60), 0.6))
-    nearer = depth.copy()
-    nearer[30, 30] = 0.4  # ends at itself
-    ends, small = speckle_free(nearer, depth > 0.0, regions(nearer), 100)
+    depth[30, 30] = 0.4  # ends at itself
+    ends, small = speckle_free(depth, depth > 0.0, regions(depth), 100)
     assert (small, ends[30, 30], ends[30, 31]) == (side**2 + 1, 0.4, 0.6)
     assert speckle_free(depth, depth > 0.0, regions(depth), 0)[1] == 0
 

@@ -4,12 +4,12 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chsel.errors import PointsError, PoseError, SettingError
+from chsel.numerics.threads import threads
 from chsel.problem.points import FreeVoxels, Lattice, Workspace
 from chsel.problem.poses import apply, axis_angle, compose, inverse, rotated
 from chsel.sensing.depth_camera import PinholeCamera
@@ -42,23 +42,21 @@ def voxels(centres):
     return found
 
 
-@pytest.fixture
-def image():
+def made_image():
     """Depths between 0.3 and 1.2 m, some of them missing, and what to use of them."""
     stream = np.random.default_rng(3)
     depth = stream.uniform(0.3, 1.2, (48, 64))
-    depth[stream.random(depth.shape) < 0.05] = np.nan
-    depth[stream.random(depth.shape) < 0.05] = np.inf
-    depth[stream.random(depth.shape) < 0.05] = 0.0
+    for missing in (np.nan, np.inf, 0.0):
+        depth[stream.random(depth.shape) < 0.05] = missing
     return depth, stream.random(depth.shape) < 0.8
 
 
-def test_the_grid_is_the_lattice_up_to_the_upper_corner():
-    assert grid().shape == (41, 41, 30)
+DEPTH, MASK = made_image()
 
 
 def test_a_ray_along_an_axis_passes_a_row_of_voxels_with_both_ends():
     free = grid()
+    assert free.shape == (41, 41, 30)
     assert free.along_rays([0.752, 0.001, 0.4], [[0.898, 0.001, 0.4]]) == 16
     expected = np.array([[0.7 + 0.01 * i, 0.0, 0.4] for i in range(5, 21)])
     np.testing.assert_allclose(free.new(), expected, atol=1e-12)
@@ -73,13 +71,14 @@ def test_a_ray_into_the_workspace_begins_at_its_border():
 
 
 def test_random_rays_mark_what_they_meet_and_nothing_far_from_them():
-    stream = np.random.default_rng(0)
-    for _ in range(60):
-        a, b = stream.uniform([0.5, -0.4, 0.2], [1.3, 0.4, 0.8], (2, 3))
+    stream, together, every = np.random.default_rng(0), grid(), set()
+    origins, ends = stream.uniform([0.5, -0.4, 0.2], [1.3, 0.4, 0.8], (2, 40, 3))
+    for a, b in zip(origins, ends, strict=True):
         free = grid()
         free.along_rays(a, b)
         centres = free.new()
         found = voxels(centres)
+        every |= found
 
         samples = a + np.linspace(0.0, 1.0, 2001)[:, None] * (b - a)
         place = (samples - WORKSPACE.lower) / SPACING + 0.5
@@ -91,17 +90,8 @@ def test_random_rays_mark_what_they_meet_and_nothing_far_from_them():
         along = np.clip((centres - a) @ way / (way @ way), 0.0, 1.0)
         off = centres - a - along[:, None] * way
         assert np.sqrt((off**2).sum(axis=1)).max(initial=0.0) <= np.sqrt(3.0) / 2.0 * SPACING
-
-
-def test_rays_may_have_an_origin_each():
-    stream = np.random.default_rng(1)
-    origins, ends = stream.uniform([0.5, -0.4, 0.2], [1.3, 0.4, 0.8], (2, 20, 3))
-    together, one_by_one = grid(), grid()
     together.along_rays(origins, ends)
-    for origin, end in zip(origins, ends, strict=True):
-        one_by_one.along_rays(origin, end)
-    assert together.count > 100
-    np.testing.assert_array_equal(together.new(), one_by_one.new())
+    assert voxels(together.new()) == every
 
 
 def test_points_are_in_the_voxels_of_the_lattice():
@@ -116,41 +106,36 @@ def test_points_are_in_the_voxels_of_the_lattice():
     assert free.new().shape == (0, 3)
 
 
-def test_an_image_is_the_rays_of_its_pixels(image):
-    depth, mask = image
+def test_an_image_is_the_rays_of_its_pixels():
     by_image, by_rays = grid(), grid()
-    fresh = by_image.from_depth(depth, CAMERA, POSE, mask, fraction=0.9)
+    fresh = by_image.from_depth(DEPTH, CAMERA, POSE, MASK, fraction=0.9)
     with np.errstate(invalid="ignore"):
-        ends = rotated(POSE[:3, :3], CAMERA.back_project(0.9 * depth)[mask]) + POSE[:3, 3]
+        ends = rotated(POSE[:3, :3], CAMERA.back_project(0.9 * DEPTH)[MASK]) + POSE[:3, 3]
     assert by_rays.along_rays(POSE[:3, 3], ends) == fresh > 5000
     np.testing.assert_array_equal(by_image.new(), by_rays.new())
 
 
-def test_the_number_of_threads_changes_nothing(threads, image, monkeypatch):
-    depth, mask = image
-    alone = grid()
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    alone.from_depth(depth, CAMERA, POSE, mask)
-    alone.at(CAMERA.back_project(depth)[mask], poses=POSE)
-    torch.set_num_threads(before)
+def test_the_number_of_threads_changes_nothing(monkeypatch):
     for name in ("_RAYS_PER_THREAD", "_POINTS_PER_THREAD"):
         monkeypatch.setattr(f"chsel.sensing.free_space.{name}", 1)
-    free = grid()
-    free.from_depth(depth, CAMERA, POSE, mask)
-    free.at(CAMERA.back_project(depth)[mask], poses=POSE)
-    assert free.count == alone.count > 5000
-    np.testing.assert_array_equal(free.new(), alone.new())
+    found = []
+    for count in (1, 2, 3):
+        free = grid()
+        with threads(count):
+            free.from_depth(DEPTH, CAMERA, POSE, MASK)
+            free.at(CAMERA.back_project(DEPTH)[MASK], poses=POSE)
+        assert free.count > 5000
+        found.append(free.new())
+    np.testing.assert_array_equal(found[1], found[0])
+    np.testing.assert_array_equal(found[2], found[0])
 
 
-def test_scaled_images_are_points_on_the_rays_with_gaps_between(image):
-    depth, mask = image
-    scaled, traversed = grid(), grid()
-    fresh = scaled.scaled_images(depth, CAMERA, POSE, mask)
-    traversed.from_depth(depth, CAMERA, POSE, mask, fraction=0.95 + 1e-9)
-    points = np.concatenate([CAMERA.back_project(scale * depth)[mask] for scale in SCALES])
+def test_scaled_images_are_points_on_the_rays_with_gaps_between():
+    scaled, traversed, plain = grid(), grid(), grid()
+    fresh = scaled.scaled_images(DEPTH, CAMERA, POSE, MASK)
+    traversed.from_depth(DEPTH, CAMERA, POSE, MASK, fraction=0.95 + 1e-9)
+    points = np.concatenate([CAMERA.back_project(scale * DEPTH)[MASK] for scale in SCALES])
     points = rotated(POSE[:3, :3], points[np.isfinite(points).all(axis=1)]) + POSE[:3, 3]
-    plain = grid()
     assert plain.at(points) == fresh
     found = voxels(scaled.new())
     assert found == voxels(plain.new())
@@ -172,21 +157,18 @@ def test_voxels_are_free_once_enough_views_saw_them():
 def test_a_grid_too_large_is_refused_with_both_numbers():
     with pytest.raises(SettingError, match=r"0\.4 x 0\.4 x 0\.29 m .* 4\.644e\+10 .*200_000_000"):
         FreeGrid(WORKSPACE, 0.0001)
-    with pytest.raises(SettingError, match="inf voxels"):
-        FreeGrid(WORKSPACE, 1e-320)
     with pytest.raises(SettingError, match="views is 251; accepted"):
         grid(views=251)
 
 
-def test_shapes_and_poses_that_do_not_fit_are_refused(image):
-    depth, mask = image
+def test_shapes_and_poses_that_do_not_fit_are_refused():
     free = grid()
     with pytest.raises(PointsError, match=r"depth has shape \(64, 48\); accepted: \(48, 64\)"):
-        free.from_depth(depth.T, CAMERA, POSE, mask)
+        free.from_depth(DEPTH.T, CAMERA, POSE, MASK)
     with pytest.raises(PointsError, match=r"mask has shape \(48,\)"):
-        free.scaled_images(depth, CAMERA, POSE, mask[:, 0])
+        free.scaled_images(DEPTH, CAMERA, POSE, MASK[:, 0])
     with pytest.raises(PoseError, match="world_from_camera"):
-        free.from_depth(depth, CAMERA, 2.0 * POSE, mask)
+        free.from_depth(DEPTH, CAMERA, 2.0 * POSE, MASK)
     with pytest.raises(PointsError, match=r"ends has shape \(5, 2\)"):
         free.along_rays(np.zeros(3), np.zeros((5, 2)))
     with pytest.raises(PointsError, match="origin has 2 points; accepted: 1, or 5"):
@@ -196,10 +178,7 @@ def test_shapes_and_poses_that_do_not_fit_are_refused(image):
 
 COUNTS = (5, 4, 3)
 LOWER = np.full(3, 0.5)  # so that voxel k is from k to k + 1
-
 places = st.tuples(*[st.integers(-12, 32).map(lambda n: n / 4.0)] * 3)
-Place = tuple[float, float, float]
-Voxel = tuple[int, ...]
 
 
 def marked(a, b):
@@ -228,95 +207,71 @@ def overlap(voxel, a, b):
 
 @settings(max_examples=150, deadline=None)
 @given(a=places, b=places)
-def test_all_voxels_that_are_passed_are_marked_and_none_that_is_not_touched(a, b):
+def test_all_voxels_that_are_passed_are_marked_and_joined_and_none_that_is_not_touched(a, b):
     found = marked(a, b)
     for voxel in np.ndindex(*COUNTS):
         inside, within = overlap(voxel, a, b)
-        if inside > 0 and within:
-            assert voxel in found
-        if inside < 0:
-            assert voxel not in found
-
-
-@settings(max_examples=150, deadline=None)
-@given(a=places, b=places)
-def test_the_voxels_of_ends_inside_are_marked_and_all_are_joined(a, b):
-    found = marked(a, b)
+        assert voxel in found or not (inside > 0 and within)
+        assert voxel not in found or inside >= 0
     for end in (a, b):
         inside = all(0.0 < x < count for x, count in zip(end, COUNTS, strict=True))
         assert not inside or tuple(int(x) for x in end) in found
     sums = np.array(sorted(found)).reshape(-1, 3)
     order = np.argsort(sums @ np.sign(np.array(b) - np.array(a)), kind="stable")
-    steps = np.abs(np.diff(sums[order], axis=0))
-    assert steps.max(initial=0) <= 1
+    assert np.abs(np.diff(sums[order], axis=0)).max(initial=0) <= 1
 
 
-def test_equal_crossings_lead_over_edges_and_corners():
-    assert marked((0.5, 0.5, 0.5), (2.5, 2.5, 2.5)) == {(0, 0, 0), (1, 1, 1), (2, 2, 2)}
-    assert marked((2.5, 0.5, 0.25), (0.5, 2.5, 0.25)) == {(2, 0, 0), (1, 1, 0), (0, 2, 0)}
+BELOW = float(np.nextafter(2.0, 0.0))
 
 
-def test_a_way_within_a_face_is_in_the_upper_voxels():
-    assert marked((0.5, 2.0, 0.5), (2.5, 2.0, 0.5)) == {(0, 2, 0), (1, 2, 0), (2, 2, 0)}
-    assert marked((2.5, 2.0, 1.0), (0.5, 2.0, 1.0)) == {(0, 2, 1), (1, 2, 1), (2, 2, 1)}
-    assert marked((0.5, 4.0, 0.5), (2.5, 4.0, 0.5)) == set()  # there is no upper one
-
-
-def test_what_a_way_only_touches_from_outside_is_not_marked():
-    assert marked((-1.0, 1.0, 0.5), (1.0, -1.0, 0.5)) == set()
-    assert marked((6.0, 1.5, 0.5), (5.0, 1.5, 0.5)) == set()
-
-
-def test_numbers_next_to_faces_and_of_no_size_do_no_harm():
-    below, tiny = float(np.nextafter(2.0, 0.0)), 5e-324
-    assert marked((below, 1.0, 1.0), (2.0, 1.0, 1.0)) == {(1, 1, 1), (2, 1, 1)}
-    assert marked((0.0, 0.0, 0.0), (tiny, -tiny, 0.0)) == {(0, 0, 0)}
-    assert marked((2.0, 2.0, 2.0), (2.0, 2.0, 2.0)) == {(2, 2, 2)}
-    assert marked((-1e15, 0.5, 0.5), (1e15, 0.5, 0.5)) == {(i, 0, 0) for i in range(5)}
+@pytest.mark.parametrize(
+    ("a", "b", "found"),
+    [  # over edges and corners
+        ((0.5, 0.5, 0.5), (2.5, 2.5, 2.5), {(0, 0, 0), (1, 1, 1), (2, 2, 2)}),
+        ((2.5, 0.5, 0.25), (0.5, 2.5, 0.25), {(2, 0, 0), (1, 1, 0), (0, 2, 0)}),
+        # within a face: in the upper voxels, if there are some
+        ((0.5, 2.0, 0.5), (2.5, 2.0, 0.5), {(0, 2, 0), (1, 2, 0), (2, 2, 0)}),
+        ((2.5, 2.0, 1.0), (0.5, 2.0, 1.0), {(0, 2, 1), (1, 2, 1), (2, 2, 1)}),
+        ((0.5, 4.0, 0.5), (2.5, 4.0, 0.5), set()),
+        # touched from outside
+        ((-1.0, 1.0, 0.5), (1.0, -1.0, 0.5), set()),
+        ((6.0, 1.5, 0.5), (5.0, 1.5, 0.5), set()),
+        # next to faces, and of no size
+        ((BELOW, 1.0, 1.0), (2.0, 1.0, 1.0), {(1, 1, 1), (2, 1, 1)}),
+        ((0.0, 0.0, 0.0), (5e-324, -5e-324, 0.0), {(0, 0, 0)}),
+        ((2.0, 2.0, 2.0), (2.0, 2.0, 2.0), {(2, 2, 2)}),
+        ((-1e15, 0.5, 0.5), (1e15, 0.5, 0.5), {(i, 0, 0) for i in range(5)}),
+    ],
+)
+def test_ways_on_borders_have_voxels_of_their_own(a, b, found):
+    assert marked(a, b) == found
 
 
 SIZE = np.array([0.10, 0.04, 0.06])
+BOX = trimesh.creation.box(SIZE)
 DIAGONAL = np.sqrt(3.0) * SPACING
 AROUND = Workspace((-0.2, -0.2, -0.1), (0.3, 0.2, 0.1))
-UP = np.array([0.0, 0.0, 1.0])
 
 
 def turns(angles):
-    return axis_angle(np.tile(UP, (len(angles), 1)), angles)
+    return axis_angle(np.tile([0.0, 0.0, 1.0], (len(angles), 1)), angles)
 
 
-def distance_to_box(points, poses):
-    """Signed distance (N,) to the union of the box at poses (P, 4, 4), from outside exact."""
-    best = np.full(len(points), np.inf)
-    for box_from_world in inverse(poses):
-        best = np.minimum(best, box_distance(apply(box_from_world, points), SIZE))
-    return best
-
-
-def test_nodes_of_a_box_are_around_its_middle_and_off_its_faces():
-    box = trimesh.creation.box(SIZE)
-    box.apply_translation([0.3, 0.2, 0.1])
-    nodes = interior_lattice(box, 0.01)
+def test_nodes_of_solids_are_around_their_middles_and_off_their_faces():
+    nodes = interior_lattice(BOX.copy().apply_translation([0.3, 0.2, 0.1]), 0.01)
     assert len(nodes) == 9 * 3 * 5
     np.testing.assert_allclose(nodes.mean(axis=0), [0.3, 0.2, 0.1], atol=1e-12)
     assert (np.abs(nodes - [0.3, 0.2, 0.1]) < 0.5 * SIZE - 1e-3).all()
-
-
-def test_thin_parts_have_nodes_and_several_solids_add_up():
-    plate = trimesh.creation.box((0.1, 0.1, 0.001))
-    ball = trimesh.creation.icosphere(radius=0.03)
-    ball.apply_translation([0.5, 0.0, 0.0])
+    plate = trimesh.creation.box((0.1, 0.1, 0.001))  # thin parts have nodes
+    ball = trimesh.creation.icosphere(radius=0.03).apply_translation([0.5, 0.0, 0.0])
     assert len(interior_lattice(plate, 0.01)) == 81
     both = interior_lattice([plate, ball], 0.01)
     near_ball = np.sqrt(((both - [0.5, 0.0, 0.0]) ** 2).sum(axis=1)) < 0.03
     assert near_ball.sum() == 93  # whole numbers with i^2 + j^2 + k^2 < 9
     assert len(both) == 81 + near_ball.sum()
     assert interior_lattice([], 0.01).shape == (0, 3)
-
-
-def test_a_spacing_that_makes_too_many_nodes_is_refused():
     with pytest.raises(SettingError, match=r"spacing is 1e-05 m.*2_000_000"):
-        interior_lattice(trimesh.creation.box(SIZE), 1e-5)
+        interior_lattice(BOX, 1e-5)
 
 
 def test_nothing_moves_further_than_a_step_and_all_poses_lie_near_the_way():
@@ -340,9 +295,8 @@ def test_poses_that_hardly_move_are_thinned():
     assert 11 <= len(way) <= 12
     assert np.diff(way[:, 0, 3]).max() <= 0.01 + 1e-12
     np.testing.assert_array_equal(way[[0, -1]], poses[[0, -1]])
-    assert len(poses_between(np.tile(np.eye(4), (100, 1, 1)), step=0.01, radius=0.2)) == 2
-    assert len(poses_between(np.eye(4)[None], step=0.01, radius=0.2)) == 1
-    assert len(poses_between(np.zeros((0, 4, 4)), step=0.01, radius=0.2)) == 0
+    for count, left in ((100, 2), (1, 1), (0, 0)):
+        assert len(poses_between(poses[:count], step=0.01, radius=0.2)) == left
 
 
 def test_poses_too_far_apart_are_refused():
@@ -354,23 +308,26 @@ def test_poses_too_far_apart_are_refused():
         poses_between(np.stack([np.eye(4), 2.0 * np.eye(4)]), step=0.005, radius=0.1)
 
 
-@pytest.mark.parametrize("turned", [0.0, 1.3, 3.0])
+@pytest.mark.parametrize("turned", [0.0, 3.0])
 def test_a_box_that_moves_and_turns_frees_the_voxels_it_passes(turned):
-    given = compose(
-        turns(np.array([0.2, 0.2 + turned])), np.array([[-0.1, 0.0, 0], [0.2, 0.05, 0]])
-    )
-    interior = interior_lattice(trimesh.creation.box(SIZE), 0.005)
+    ends = np.array([[-0.1, 0.0, 0], [0.2, 0.05, 0]])
+    given = compose(turns(np.array([0.2, 0.2 + turned])), ends)
     grid = FreeGrid(AROUND, SPACING)
-    fresh = grid.at(interior, poses=poses_between(given, step=0.005, radius=0.07))
+    way = poses_between(given, step=0.005, radius=0.07)
+    fresh = grid.at(interior_lattice(BOX, 0.005), poses=way)
     centres = grid.new()
     assert len(centres) == fresh
 
     s = np.linspace(0.0, 1.0, 301)
-    position = given[0, :3, 3] + s[:, None] * (given[1] - given[0])[:3, 3]
-    dense = compose(turns(0.2 + s * turned), position)
-    assert distance_to_box(centres, dense).max() <= 0.5 * DIAGONAL
+    dense = compose(turns(0.2 + s * turned), ends[0] + s[:, None] * (ends[1] - ends[0]))
+
+    def distance(points):
+        """Signed distance (N,) to the union of the box on its way, from outside exact."""
+        return np.min([box_distance(apply(pose, points), SIZE) for pose in inverse(dense)], axis=0)
+
+    assert distance(centres).max() <= 0.5 * DIAGONAL
     every = grid.lattice.centres(np.indices(grid.shape).reshape(3, -1).T)
-    wholly = every[distance_to_box(every, dense) < -0.5 * DIAGONAL]
+    wholly = every[distance(every) < -0.5 * DIAGONAL]
     assert len(wholly) > 100
     grid.at(wholly)
     assert len(grid.new()) == 0  # all of them were free before
