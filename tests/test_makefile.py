@@ -4,13 +4,14 @@ import shutil
 import subprocess
 import sys
 import venv
-from pathlib import Path
 
 import pytest
 
-REPOSITORY = Path(__file__).resolve().parents[1]
-MAKE = shutil.which("make")
-pytestmark = pytest.mark.skipif(MAKE is None, reason="make is not installed")
+from tests.chsel.samples import REPOSITORY
+
+pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+OPTIONS = "--index-url=URL --no-deps"
+INSTALL = f".venv/bin/python -m pip install --quiet {OPTIONS} --constraint .venv/constraints.txt"
 
 
 def made(folder, *words):
@@ -19,20 +20,15 @@ def made(folder, *words):
     command = ["make", f"PYTHON={sys.executable}", *words]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    return done.stdout
+    return done.stdout.splitlines()
 
 
-OPTIONS = "--index-url=URL --no-deps"
-INSTALL = f".venv/bin/python -m pip install --quiet {OPTIONS} --constraint .venv/constraints.txt"
-STEPS = [f'{INSTALL} --editable ".[{extra}]"' for extra in ("all", "test")]
-
-
-@pytest.mark.parametrize("goal", ["probe", "test"])
-def test_make_passes_options_on_to_pip_and_venv(goal, tmp_path):
+@pytest.mark.parametrize(("goal", "extras"), [("probe", ["all"]), ("test", ["all", "test"])])
+def test_make_passes_options_on_to_pip_and_venv(goal, extras, tmp_path):
     words = (f"PIP_ARGS={OPTIONS}", "VENV_ARGS=--system-site-packages")
-    lines = made(tmp_path, "-n", goal, *words).splitlines()
+    lines = made(tmp_path, "-n", goal, *words)
     steps = [line for line in lines if "pip install" in line]
-    assert steps == STEPS[: {"probe": 1, "test": 2}[goal]]
+    assert steps == [f'{INSTALL} --editable ".[{extra}]"' for extra in extras]
     assert any(" -m venv --system-site-packages .venv" in line for line in lines)
 
 
