@@ -147,22 +147,6 @@ def test_an_arrow_back_up_is_seen(tmp_path):
     assert len(found) == len(ABOVE)
 
 
-def test_imports_of_lower_folders_are_no_arrow_back_up(tmp_path):
-    files = {
-        "errors.py": "",
-        "numerics/a.py": "from chsel.errors import ChselError",
-        "problem/b.py": "import numpy\nfrom chsel.numerics import a",
-        "methods/method.py": "from chsel.problem.b import Points",
-        "methods/chsel.py": "from chsel.methods.anchor_sampling import AnchoredStarts",
-        "methods/anchor_sampling.py": "from chsel.methods.method import Method",
-        "methods/__init__.py": "from chsel.methods.chsel import Chsel",
-        "api.py": "from chsel.methods import build_method",
-    }
-    graph = plant(tmp_path, files)
-    assert graph["chsel.methods.chsel"] == {"chsel.methods.anchor_sampling"}
-    assert forbidden_imports(graph) == circles(graph) == []
-
-
 def test_a_circle_inside_a_folder_is_seen(tmp_path):
     files = {
         "cost/a.py": "from chsel.cost.b import B",

@@ -11,8 +11,6 @@ import pytest
 import trimesh
 from numba.core.registry import CPUDispatcher
 
-from chsel.numerics.compiler import compiled
-from chsel.numerics.elementary import _remainder
 from chsel.plausible.plausible_set import plausible_set
 from chsel.plausible.plausible_settings import PlausibleSettings, PoseGridSettings
 from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance
@@ -181,15 +179,3 @@ def test_what_compilers_like_to_fuse_or_call_would_be_found(cpu):
     assert not fused(text, cpu)
     (text,) = optimised(numba.njit("float64(float64)")(lambda x: math.exp(x) + math.sin(x)))
     assert {"exp", "sin"} <= {word for name in called(text) for word in re.findall("exp|sin", name)}
-
-
-def test_code_from_the_cache_is_seen_as_freshly_compiled_code_is():
-    function = _remainder.py_func
-    fresh = numba.njit(nogil=True, error_model="numpy")(function)
-    compiled(function)(10.0)
-    cached = compiled(function)
-    assert fresh(10.0) == cached(10.0) == 10.0 - 2.0 * math.pi
-    assert cached.stats.cache_hits
-    assert not fresh.stats.cache_hits
-    (one,), (other,) = optimised(fresh), optimised(cached)
-    assert one.count(" fmul ") == other.count(" fmul ") > 0

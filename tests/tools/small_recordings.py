@@ -32,25 +32,15 @@ from replay.recorder import ListRecorder
 from replay.registration import register_recorded, symmetry_for_errors
 
 _SIDES = (0.1, 0.06, 0.04)
-_DESCENT = {"restarts": 2, "iterations": 4, "stop_below": None}
-_ONLINE = {"hypotheses": 4}
-_COST = {"penetration_tolerance": -0.005}
-STEERED = {
-    "probes": 3,
-    "stop": {"spread": 0.0, "gain": 0.0},
-    "belief": {"poses": 8},
-    "blocked": 1.0,
+STEERED = {"probes": 3, "stop": {"spread": 0.0, "gain": 0.0}, "belief": {"poses": 8}}
+STEERED["blocked"] = 1.0
+_DESCENT = {
+    "descent": {"restarts": 2, "iterations": 4, "stop_below": None},
+    "online": {"hypotheses": 4},
+    "cost": {"penetration_tolerance": -0.005},
 }
-METHODS = {
-    "gradient_descent": {"descent": _DESCENT, "online": _ONLINE, "cost": _COST},
-    "chsel": {
-        "descent": _DESCENT,
-        "online": _ONLINE,
-        "cost": _COST,
-        "emitter": {"iterations": 12},
-        "archive": {"bins": 6},
-    },
-}
+_SEARCH = {"emitter": {"iterations": 12}, "archive": {"bins": 6}}
+METHODS = {"gradient_descent": _DESCENT, "chsel": _DESCENT | _SEARCH}
 
 
 def registered_session(name, *, seed=3):

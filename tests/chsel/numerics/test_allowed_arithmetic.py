@@ -97,13 +97,10 @@ FUNCTION = "import math as m\nimport numpy as np\nBITS = 20\nRATE = 0.5\n@compil
     [
         "return m.exp(x)",
         "return np.sin(x) + 1.0",
-        "return np.linalg.norm(x)",
         "return x.T.sum()",
         "return sum(x)",
         "return x @ x",
         "return x**RATE",
-        "return 2.0 ** (x + 1)",
-        "x **= y",
         "return pow(x, 2)",
         "from math import cos",
         "from numpy.linalg import norm",

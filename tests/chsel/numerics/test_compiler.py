@@ -99,12 +99,6 @@ def test_two_processes_compile_at_once_and_a_third_nothing(tmp_path):
     assert {each.stat().st_mode & 0o777 for each in (folder, *folder.iterdir())} == {0o700}
 
 
-def test_code_is_kept_apart_for_each_option_of_the_compiler():
-    show = "from chsel.numerics.compiler import cache_directory; print(cache_directory())"
-    processes = [start(show, **{name: "1"}) for name in ("NUMBA_OPT", "NUMBA_BOUNDSCHECK")]
-    assert len({result_of(process)[0] for process in processes}) == 2
-
-
 def test_a_folder_that_others_can_write_to_is_refused(tmp_path, monkeypatch):
     named = tmp_path / "open" / "named"
     named.mkdir(parents=True, mode=0o700)

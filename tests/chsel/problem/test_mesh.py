@@ -43,16 +43,11 @@ def test_a_scene_becomes_one_mesh_with_its_parts_in_place(tmp_path):
     assert mesh.volume == pytest.approx(0.012, rel=1e-6)
 
 
-def test_bodies_far_apart_are_kept_with_a_warning_that_counts_them():
+def test_bodies_far_apart_are_counted_and_parts_near_one_another_one_object_however_many():
+    """A row of parts is longer than what is far apart, and no two neighbours are."""
     two = trimesh.util.concatenate([BOX, moved(BOX, 0.05, 0.0, 0.0), moved(BOX, 0.0, 1.0, 0.0)])
     with pytest.warns(MeshWarning, match=r"shelf has 2 bodies at least 0\.8 m apart, .* 0\.374 m"):
-        mesh = clean_mesh(two.vertices, two.faces, name="shelf")
-    assert len(mesh.faces) == 36
-    assert mesh.extents == pytest.approx([0.15, 1.2, 0.3])
-
-
-def test_parts_near_one_another_are_one_object_however_many():
-    """A row of parts is longer than what is far apart, and no two neighbours are."""
+        assert len(clean_mesh(two.vertices, two.faces, name="shelf").faces) == 36
     row = [moved(BOX, 0.25 * k, 0.0, 0.0) for k in range(8)]
     crumb = moved(trimesh.creation.box((0.001, 0.001, 0.001)), 0.0, 0.25, 0.0)
     parts = trimesh.util.concatenate([*row, crumb])
@@ -127,21 +122,18 @@ def test_a_mesh_that_cannot_be_is_named(vertices, faces, message):
         clean_mesh(vertices, faces, name="bowl")
 
 
-def test_millimetres_are_suspected_and_scaled_away():
+def test_sizes_up_to_the_bounds_are_accepted_and_millimetres_suspected():
+    for accepted, refused in [(9.99, 10.01), (0.00501, 0.00499)]:
+        mesh = clean_mesh(BOX.vertices, BOX.faces, scale=accepted / 0.3)
+        assert mesh.extents.max() == pytest.approx(accepted)
+        with pytest.raises(MeshError, match=r"largest extent of 0\.005 m to 10 m"):
+            clean_mesh(BOX.vertices, BOX.faces, scale=refused / 0.3)
     thousandfold = BOX.vertices * 1000
     with pytest.raises(MeshError, match=r"100 x 200 x 300 m; looks like millimetres.*scale=0\.001"):
         clean_mesh(thousandfold, BOX.faces)
     assert clean_mesh(thousandfold, BOX.faces, scale=0.001).extents == pytest.approx(EXTENTS)
     with pytest.raises(SettingError, match="mesh scale"):
         clean_mesh(BOX.vertices, BOX.faces, scale=0.0)
-
-
-@pytest.mark.parametrize(("accepted", "refused"), [(9.99, 10.01), (0.00501, 0.00499)])
-def test_sizes_up_to_the_bounds_are_accepted(accepted, refused):
-    mesh = clean_mesh(BOX.vertices, BOX.faces, scale=accepted / 0.3)
-    assert mesh.extents.max() == pytest.approx(accepted)
-    with pytest.raises(MeshError, match=r"largest extent of 0\.005 m to 10 m"):
-        clean_mesh(BOX.vertices, BOX.faces, scale=refused / 0.3)
 
 
 def test_the_digest_names_content():

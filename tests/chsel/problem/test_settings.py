@@ -37,7 +37,6 @@ def test_every_preset_survives_the_way_through_a_mapping(method):
     [
         ({"cots": {}}, r"method.cots does not exist; did you mean cost\? accepted: archive, cost"),
         ({"cost": {"free_scale": "x"}}, r"method.cost.free_scale is 'x'; accepted: a number"),
-        ({"passes": 1.5}, r"method.passes is 1.5; accepted: an integer"),
         ({"passes": True}, r"method.passes is True; accepted: an integer"),
         ({"cost": 3}, r"method.cost is 3; accepted: a group"),
         ({"cost": {"lookup": None}}, r"method.cost.lookup is None; accepted: a text"),
@@ -72,11 +71,9 @@ class Checked(CheckedSettings):
     [
         ({"rate": 0.0}, "rate is 0.0; accepted: a finite number above 0"),
         ({"rate": float("nan")}, "rate is nan; accepted: a finite number above 0"),
-        ({"rate": "x"}, "rate is 'x'; accepted: a finite number above 0"),
         ({"count": -1}, "count is -1; accepted: a finite number of at least 0"),
         ({"count": 1_001}, "count is 1001; accepted: at most 1_000"),
         ({"length": 20.0}, r"length is 20.0; accepted: 0.001 to 10 (m)"),
-        ({"length": float("nan")}, r"length is nan; accepted: 0.001 to 10 (m)"),
         ({"name": "c"}, "name is 'c'; accepted: a, b"),
         ({"limit": 6.0}, "limit is 6.0; accepted: at most 5.0"),
         ({"limit": 0.5}, "rate is 1.0; accepted: at most limit"),
@@ -98,7 +95,6 @@ def test_values_at_the_limits_and_none_pass_where_the_type_has_it():
 
 POLICY = """
 from dataclasses import dataclass
-from chsel.cost.cost_settings import CostSettings
 from chsel.policies.policy import ConfiguredPolicy, PolicySettings
 
 @dataclass(frozen=True)
@@ -113,9 +109,6 @@ class Plain:
 
 class Unlike:
     settings = {}
-
-class Other:
-    settings = CostSettings()
 
 class Unready:
     def __init__(self):
@@ -159,7 +152,6 @@ def test_a_choice_of_a_package_is_built_as_ours_are(install):
         (["mine = mine:Unready"], "cannot be loaded: RuntimeError: no licence; accepted: a"),
         (["mine = nowhere:Mine"], "policy mine of package mine0 cannot be loaded: ModuleNotFound"),
         (["mine = mine:Unlike"], "has settings {}; accepted: a frozen dataclass"),
-        (["mine = mine:Other"], "one derived from Policy"),
         (["mine = mine:Plain"], "has no `decide`; accepted: decide(problem); see docs/page"),
         (["mine = mine:Mine"] * 2, "policy mine is of mine0 and mine1; accepted: one of"),
     ],

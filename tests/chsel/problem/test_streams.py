@@ -1,7 +1,7 @@
 import numba
 import numpy as np
 import pytest
-from scipy.stats import kstest, norm
+from scipy.stats import kstest
 
 from chsel.errors import SettingError
 from chsel.numerics.philox import fill_uniforms
@@ -10,22 +10,6 @@ from chsel.problem.streams import Purpose, StreamKey, normals, uniforms
 
 def stream(seed=3):
     return StreamKey(seed, 0).stream(Purpose.EMITTER)
-
-
-class Fixed:
-    """A stream whose every uniform number is the same."""
-
-    def __init__(self, value):
-        self.value = value
-
-    def random(self, shape):
-        return np.full(shape, self.value)
-
-
-def test_normals_follow_the_law_of_gauss():
-    many = normals(stream(), 1_000_000)
-    for some in (many, many[0::2], many[1::2]):
-        assert kstest(some, norm.cdf).pvalue > 0.01
 
 
 def test_normals_are_made_of_the_raw_output_two_by_two():
@@ -47,12 +31,6 @@ def test_fewer_numbers_are_the_first_of_more_and_take_whole_pairs():
     taken = stream()
     assert normals(taken, (4, 0, 2)).shape == (4, 0, 2)
     assert taken.random() == stream().random()
-
-
-def test_the_least_and_the_largest_uniform_number_give_finite_ones():
-    np.testing.assert_array_equal(np.abs(normals(Fixed(0.0), 2)), [0.0, 0.0])
-    largest = normals(Fixed(1.0 - 2.0**-53), 2)
-    assert largest[0] == pytest.approx(np.sqrt(106.0 * np.log(2.0)), rel=1e-15)
 
 
 def test_uniforms_fill_their_box():

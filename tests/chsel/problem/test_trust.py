@@ -24,14 +24,11 @@ from chsel.problem.trust import (
     MOST_OFF,
     MOST_SYSTEMATIC,
     MOST_WIDTH,
-    SYMMETRIC,
     can_be_moved,
     check_trust,
-    correlation,
     has_pose,
     pose_energies,
     trust_in,
-    turned,
 )
 from tests.chsel.samples import hypotheses_at, plain_energies
 
@@ -139,9 +136,6 @@ def test_a_wrong_scale_fits_nothing(scale):
     trust = judged(hypotheses(POSE), sdf=sdf, known=on_box())
     (warning,) = check_trust(trust)
     assert (warning.code, warning.text[:38]) == ("no_fit", "no hypothesis explains the points, see")
-    shifted = judged(hypotheses(moved(x=0.03)), sdf=sdf, known=on_box())
-    assert shifted.misfit != trust.misfit
-    assert check_trust(shifted)[0].text == warning.text  # which Python shows once
 
 
 def test_a_sensor_less_exact_than_stated_is_a_warning():
@@ -312,19 +306,6 @@ def test_twins_are_told_apart_and_true_symmetries_are_not():
         assert str(trust).startswith("determined up to a turn of 90 degrees, ")
 
 
-def test_turns_count_beyond_symmetries():
-    """A box with sides 0.1 and 0.106: a quarter turn moves 3 mm, one of 0.1 and 0.101 less."""
-    for other, expected in ((0.106, True), (0.101, False)):
-        sdf = chsel.SdfGrid.from_mesh(trimesh.creation.box((0.1, other, 0.16)), 0.004)
-        assert (0.5 * (other - 0.1) * 0.87 > SYMMETRIC * sdf.diameter) is expected
-        angles = (0.0, 0.3, 0.5 * math.pi, math.pi, 1.0)
-        poses = Poses.of(inverse(np.array([moved(about_z=angle) for angle in angles])))
-        flags = turned(sdf, poses, np.ones((5, 5), dtype=bool))
-        np.testing.assert_array_equal(flags, flags.T)
-        assert flags[0].tolist() == [False, False, expected, False, True]
-        assert not turned(sdf, poses, np.eye(5, dtype=bool)).any()
-
-
 def test_the_spread_is_the_root_mean_square_of_surfaces_of_all_pairs():
     """Of balls d apart, each point of a surface is d |cos| off the other, d / sqrt(3) on average.
 
@@ -349,24 +330,6 @@ def test_points_that_a_pose_can_fit_exactly_are_no_evidence():
     assert "no evidence" not in str(inside)
 
 
-def test_distances_of_outlines_are_those_of_shifts_and_turns():
-    """A shift along x moves the two sides across x by it, and the others within themselves."""
-    shift = 0.01
-    poses = Poses.of(inverse(np.array([POSE, moved(x=shift), moved(about_z=math.pi)])))
-    apart = outline_distances(GRID, poses)
-    across = 2 * SIDES[1] * SIDES[2] / BOX.area  # share of the surface
-    assert apart[0, 1] == pytest.approx(shift * math.sqrt(across), rel=0.25)
-    assert apart[0, 2] < 0.001
-    np.testing.assert_array_equal(apart, apart.T)
-
-
-def test_errors_are_alike_on_sides_and_not_in_noise():
-    signs = np.where(NORMALS[:, 0] > 0.0, 1.0, -1.0)
-    assert correlation(NORMALS, signs) > 0.7
-    assert abs(correlation(NORMALS, np.random.default_rng(0).standard_normal(60))) < 0.3
-    assert correlation(NORMALS[:7], signs[:7]) == correlation(NORMALS, np.zeros(60)) == 0.0
-
-
 def test_poses_that_are_not_finite_or_repeated_are_left_out():
     posed = problem(known=at_height(0.0))
     poses = TURNED_BALL.object_from_world.copy()
@@ -389,9 +352,6 @@ def test_an_object_thinner_than_its_grid_is_judged_too():
     middle = known[np.abs(apply(inverse(POSE), known)[:, 0]) < 0.03]
     slid = hypotheses(POSE, moved(x=0.02))  # along itself
     assert judged(slid, sdf=sdf, known=middle).spread > 0.002
-    nowhere = chsel.SdfGrid(np.zeros(3), 0.01, np.ones((4, 4, 4)), np.ones((4, 4, 4, 3)))
-    trust = judged(hypotheses(POSE), sdf=nowhere, known=known)
-    assert (trust.verdict, trust.modes) == ("nothing fits", 0)
 
 
 def movable(mesh, noise=NOISE, **points):
