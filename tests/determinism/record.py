@@ -92,8 +92,8 @@ ENVIRONMENTS = {
     "default": ({}, ()),
     "generic CPU, libraries without SIMD": (_GENERIC | _plain_libraries(), ()),
     "Haswell with FMA, two threads": (_HASWELL if HAS_FMA else {}, ("--threads", "2")),
-    "logged and scribbled over": ({}, ("--watch", "scribbler")),
-    "after other problems, nobody watching": ({}, ("--again", "--watch", "nobody")),
+    "after other problems, scribbled over": ({}, ("--again", "--watch", "scribbler")),
+    "nobody watching": ({}, ("--watch", "nobody")),
 }
 
 

@@ -19,7 +19,8 @@ from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd.emitters import SEARCHES
 from chsel.qd.measures import MEASURES
 
-PROBLEMS_FILE = Path(__file__).with_name("problems.npz")  # so that no mesh, sine or BLAS matters
+PROBLEMS_FILE = Path(__file__).with_name("problems.npz")
+"""Grids of two bodies, and points around them: stored, so that no mesh, sine or BLAS matters."""
 
 
 @cache

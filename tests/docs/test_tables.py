@@ -90,9 +90,6 @@ def test_the_program_of_the_next_probe_runs():
 
 
 ORDER = ("paper", "reference", "default")
-TABLE = re.compile(
-    r"Of (?P<of>[^.:]+):\n\n\| setting \| paper \|.*\n\|[-|]+\|\n(?P<rows>(?:\|.*\n)+)",
-)
 PRINTED = re.compile(r"^\| [^|]+ \| `(?P<setting>[\w.]+)` \| (?P<value>[-\d.]+) \|$", re.MULTILINE)
 
 
@@ -116,16 +113,17 @@ def differences(settings, path=""):
             yield name, values
 
 
-def on_the_page(of):
-    """Cells of paper, reference and default of a method, by setting."""
-    found = {}
-    for table in TABLE.finditer(PRESETS):
-        for row in table["rows"].splitlines() if f"`{of}`" in table["of"] else ():
-            setting, *cells = (cell.strip() for cell in row.strip("|").split(" | "))
+def on_the_page():
+    """Cells of paper, reference and default by method and setting."""
+    found, of = {}, []
+    for block in PRESETS.split("\n\n"):
+        of = re.findall(r"`(\w+)`", block) if block.startswith("Of ") else of
+        for row in block.splitlines()[2:] if block.startswith("| setting | paper |") else ():
+            setting, *cells = (cell.strip("|` ") for cell in row.split(" | "))
             assert len(cells) == 4, row
-            assert cells[3].strip(" |"), f"{setting} has no reason"
-            assert setting.strip("` ") not in found, row
-            found[setting.strip("` ")] = cells[:3]
+            assert cells[3], f"{setting} has no reason"
+            assert not {(name, setting) for name in of} & set(found), row
+            found |= {(name, setting): cells[:3] for name in of}
     return found
 
 
@@ -143,12 +141,12 @@ def same(cell, value):
 
 @pytest.mark.parametrize("name", [*OURS, "session", "definition"])
 def test_every_setting_in_which_presets_differ_is_on_the_page(name):
-    page, code = on_the_page(name), dict(differences([settings_of(name, one) for one in ORDER]))
+    page = {setting: cells for (of, setting), cells in on_the_page().items() if of == name}
+    code = dict(differences([settings_of(name, one) for one in ORDER]))
     assert sorted(page) == sorted(code)
     for setting, values in code.items():
         for preset, cell, value in zip(ORDER, page[setting], values, strict=True):
             assert same(cell, value), f"{name}, {setting}, {preset}: {cell} for {value}"
-    assert len(TABLE.findall(PRESETS)) == PRESETS.count("| setting | paper |")
 
 
 def test_printed_numbers_are_those_of_all_presets():

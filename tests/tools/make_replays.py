@@ -1,10 +1,10 @@
 """Makes stored replays: `python -m tests.tools.make_replays [NAME ...]`, of today's code.
 
 Existing files stay as they are, as the bits that later code must give; to accept new bits, use
-`python -m replay accept`. Needs PyBullet for simulated sessions.
+`python -m replay accept`.
 
 `points_default_METHOD` has the settings of preset `default` without any change: when the preset
-changes, it is made again. The others keep older settings, and some are cut to two registrations.
+changes, it is made again. Others, of sessions of all kinds, keep older settings.
 """
 
 import argparse
@@ -16,76 +16,37 @@ from pathlib import Path
 
 import numpy as np
 
+from chsel.methods import OURS
 from chsel.problem.poses import apply, axis_angle, compose
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.settings import PRESETS
 from runners.objects.loader import ObjectConfig, load_object
 from tests.tools.small_recordings import steered_session, write_recording
 
 FOLDER = Path(__file__).parents[1] / "replays"
 STEERED = "box_steered"  # the one with decisions
-_BRIEF = "recording=mcap recording.snapshot_interval=0"
-_SMALL = "session.object_resolution=0.03 session.free_resolution=0.05"
-_OF_POINTS = f"object.scale=1 session=points session.path=points.npz {_BRIEF}"
-_FEW = f"{_OF_POINTS} session.object_resolution=0.015 session.start_probe=2"  # the last two
-_FINE = f"{_OF_POINTS} session.object_resolution=0.01"
-_QUICK = "method.archive.bins=10 method.emitter.iterations=30"
-_BY_CHSEL = f"{_FINE} method=chsel {_QUICK}"
-_CHSEL, _MEDIAL = ("chsel", "chsel_cma_me"), ("medial_constraint", "medial_constraint_cma_me")
-_BASELINES = {  # with what keeps those brief that take long
-    "icp": "",
-    "svgd": "",
-    "cvo": "method.max_iterations=20",
-    "cvo_no_free_space": "method.max_iterations=20",
-    "medial_constraint": "method.cma_es.generations=60",
-    "medial_constraint_cma_me": f"method.cma_es.generations=40 {_QUICK}",
-    "anchored": "method.size=small method.archive.bins=10",
-}
-# The presets of CHSEL, CHSEL with CMA-ME and gradient descent, and which others are stored: some
-# objects have large meshes and grids.
-_OBJECTS = {
-    "drill": ("default paper reference", ()),
-    "mustard": ("paper reference default", tuple(_BASELINES)),
-    "hammer": ("reference default paper", ("icp",)),
-    "cracker_box": ("default paper default", tuple(_BASELINES)),
-    "spam_can": ("paper default reference", ("icp",)),
-    "clamp": ("default reference paper", tuple(_BASELINES)),
-}
-_FULL = (*_CHSEL, *_MEDIAL, "gradient_descent", "svgd", "cvo", "cvo_no_free_space", "anchored")
+_OF_POINTS = "object.scale=1 session=points session.path=points.npz recording=mcap"
+_OF_POINTS += " recording.snapshot_interval=0 session.object_resolution"
+_DEFAULT = f"object=spam_can {_OF_POINTS}=0.015 session.start_probe"
+_BY_CHSEL = f"{_OF_POINTS}=0.01 method=chsel method.archive.bins=10 method.emitter.iterations=30"
+_SMALL = ("gradient_descent", "cvo", "anchored", "icp")  # of others, two steps are too large
 
 
 def cases():
-    """Arguments of `python -m runners.probe` by name; older files were made with other ones."""
-    found = {STEERED: ""}  # by `tests.tools.small_recordings`: those of commands are larger
-    for name, (presets, stored) in _OBJECTS.items():
-        for method, preset in zip((*_CHSEL, "gradient_descent"), presets.split(), strict=True):
-            quick = _QUICK if method in _CHSEL else ""
-            found[f"{name}_{method}"] = (
-                f"object={name} preset={preset} method={method} {_FEW} {quick}"
-            )
-        for index, method in enumerate(_BASELINES):
-            session = ("kinematic", "simulated")[index % 2]
-            preset, start = PRESETS[(index + len(name)) % len(PRESETS)], 10
-            if method in _MEDIAL and name != "clamp":  # one step, for its size
-                start = 15 if name == "mustard" else 11
-            if method in stored:
-                found[f"{name}_{method}"] = (
-                    f"object={name} session={session} preset={preset} method={method} {_BRIEF} "
-                    f"{_SMALL} session.start_probe={start} {_BASELINES[method]}"
-                )
-    for method in (*_FULL, "icp"):
-        few = method in ("gradient_descent", "cvo", "anchored", "icp")  # others are too large
-        one = "" if few else " session.start_probe=3"
-        found[f"points_default_{method}"] = f"object=spam_can method={method} {_FEW}{one}"
+    """Arguments of `python -m runners.probe` by name."""
     table = "method.plane={plane_height:0.0} method.archive.measure=plane_position"
     volume = "preset=reference method.cost.volume_normalise=true"
     exact = "method.cost.gradient=exact method.cost.known_tolerance=0.002"
-    return found | {
+    return {
+        STEERED: "",  # by `tests.tools.small_recordings`: those of commands are larger
+        **{
+            f"points_default_{method}": f"{_DEFAULT}={2 if method in _SMALL else 3} method={method}"
+            for method in OURS
+        },
         "points_mustard": f"object=mustard {_BY_CHSEL} recording.snapshot_interval=10",
         "points_two_passes": f"object=drill {_BY_CHSEL} method.passes=2 seed=3",
         "points_on_a_table": f"object=spam_can {_BY_CHSEL} {table}",
         "points_interior": f"object=hammer {_BY_CHSEL} {volume}",
-        "points_exact_descent": f"object=clamp {_FINE} method=gradient_descent {exact}",
+        "points_exact_descent": f"object=clamp {_OF_POINTS}=0.01 method=gradient_descent {exact}",
     }
 
 
@@ -118,8 +79,7 @@ def make(name, arguments):
         write_recording(target, steered_session())
         return target
     with tempfile.TemporaryDirectory() as folder:
-        if "session=points" in arguments:
-            write_points(Path(folder) / "points.npz", arguments[0].removeprefix("object="))
+        write_points(Path(folder) / "points.npz", arguments[0].removeprefix("object="))
         command = [sys.executable, "-m", "runners.probe", "logs=.", *arguments]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder)
         (recording,) = Path(folder).rglob("recording.mcap")
