@@ -1,40 +1,32 @@
 """`python -m tests.tools.kill_sessions --count N --seed S`: kills sessions, and recovers them.
 
-Each session runs in a fork of this process, where all is imported and compiled, through the code
-of `runners.probe`, and says on a pipe what its display says. At a random moment it gets SIGKILL.
+Each session is `runners.probe` in a fork of this process, where all is imported and compiled, and
+says on a pipe what its display says. At a random moment it gets SIGKILL.
 Then every probe that it had reported must come back, with all its events, to the bit.
 """
 
 import argparse
-import io
+import math
 import os
 import re
 import signal
 import sys
 import tempfile
 import time
-from contextlib import redirect_stdout
 from pathlib import Path
 
-import hydra
 import numpy as np
 import torch
 import trimesh
 
 from chsel.errors import RecordingError
-from chsel.methods import build_method
 from chsel.problem.poses import apply, axis_angle, compose
-from chsel.problem.settings import build_settings
 from replay.events import Probe, ProblemPosed, SessionEnded
 from replay.mcap.reader import read_recording
 from replay.mcap.recovery import recover, tells_loss
-from runners.command.choices import CONF, store_choices
-from runners.command.program import plain
-from runners.run.display import Display
-from runners.run.probe_run import Interrupt, run
-from runners.run.recording import make_run_folder
-from runners.run.scene import ProbeConfig, open_scene, session_started
+from runners import probe
 from tests.replay.conftest import same_bits
+from tests.runners.in_process import run
 
 METHODS = ("gradient_descent", "chsel")
 PROBES = 6
@@ -78,9 +70,9 @@ def kill_many(count, seed):
         folder = Path(name)
         references = [_reference(folder, method) for method in METHODS]
         for index in range(count):
-            session, events, seconds = references[index % len(references)]
+            overrides, events, seconds = references[index % len(references)]
             logs = folder / str(index)
-            output, killed = _forked(session, logs, random.uniform(0.0, seconds))
+            output, killed, _ = _forked(overrides, logs, random.uniform(0.0, seconds))
             told = reported_probes(output)
             kept = _recovered_probes(events, logs, told)
             ended += not killed
@@ -94,41 +86,24 @@ def kill_many(count, seed):
 
 
 def _reference(folder, method):
-    """A session, all that it records when nobody disturbs it, and the seconds of a fork of it."""
-    session = _session(folder, method)
+    """Overrides of a session, all that it records, and the seconds that its file is open."""
+    more = _CHSEL if method == "chsel" else ()
+    overrides = [*points_session(folder), f"method={method}", *_QUICK, *more]
     logs = folder / f"reference_{method}"
-    with redirect_stdout(io.StringIO()):
-        session(logs)  # which compiles its kernels, too
+    assert run(probe.main, *overrides, f"logs={logs}").returncode == 0  # compiles its kernels, too
     (path,) = logs.rglob("recording.mcap")
     events = list(read_recording(path).events())
     assert sum(isinstance(event, ProblemPosed) for event in events) == PROBES
-    begun = time.perf_counter()
-    output, killed = _forked(session, folder / "timed", 60.0)
+    output, killed, seconds = _forked(overrides, folder / "timed", 60.0)
     assert (killed, reported_probes(output)) == (False, PROBES)
-    return session, events, time.perf_counter() - begun
+    return overrides, events, seconds
 
 
-def _session(folder, method_name):
-    """What the command does, into the logs it is given, once its scene is open."""
-    store_choices()
-    more = _CHSEL if method_name == "chsel" else ()
-    overrides = [*points_session(folder), f"method={method_name}", *_QUICK, *more]
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        values = plain(hydra.compose("probe", overrides))
-    checked = build_settings(ProbeConfig, values, "probe")
-    config = {name: value for name, value in checked.method.items() if name != "name"}
-    method, scene = build_method(method_name, config), open_scene(checked)
-    started = session_started(checked, values, method_name, scene)
+def _forked(overrides, logs, moment):
+    """What a session in a fork printed, whether it was killed, and seconds that it had a file.
 
-    def session(logs):
-        folder = make_run_folder(logs / "probe", scene.object_name, method_name)
-        run(folder, checked, method, scene, started, Interrupt(), Display("killed"))
-
-    return session
-
-
-def _forked(session, logs, moment):
-    """What a session in a fork printed before it was killed or ended, and whether it was killed."""
+    It is killed a moment, in seconds, after it has made its file.
+    """
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -137,22 +112,26 @@ def _forked(session, logs, moment):
             os.close(reading)
             os.dup2(writing, 1)
             sys.stdout = os.fdopen(1, "w", encoding="utf-8")
-            session(logs)
+            sys.argv = ["probe", *overrides, f"logs={logs}"]
+            probe.main()
             sys.stdout.flush()
             status = 0
         finally:
             os._exit(status)
     os.close(writing)
-    deadline, done = time.perf_counter() + moment, 0
-    while not done and (left := deadline - time.perf_counter()) > 0.0:
-        time.sleep(min(0.002, left))
+    done, made = 0, math.inf
+    while not done and time.perf_counter() < made + moment:
+        time.sleep(0.002)
+        if made == math.inf and any(logs.rglob("recording.mcap")):
+            made = time.perf_counter()
         done, status = os.waitpid(child, os.WNOHANG)
+    lived = time.perf_counter() - made
     if not done:
         os.kill(child, signal.SIGKILL)
         _, status = os.waitpid(child, 0)
     assert status in (0, signal.SIGKILL), "a session failed by itself"
     with os.fdopen(reading, encoding="utf-8") as pipe:
-        return pipe.read(), os.WIFSIGNALED(status)
+        return pipe.read(), os.WIFSIGNALED(status), lived
 
 
 def _recovered_probes(expected, logs, reported):
