@@ -10,8 +10,6 @@ import pytest
 from tests.chsel.samples import REPOSITORY
 
 pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-OPTIONS = "--index-url=URL --no-deps"
-INSTALL = f".venv/bin/python -m pip install --quiet {OPTIONS} --constraint .venv/constraints.txt"
 
 
 def made(folder, *words):
@@ -21,15 +19,6 @@ def made(folder, *words):
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
-
-
-@pytest.mark.parametrize(("goal", "extras"), [("probe", ["all"]), ("test", ["all", "test"])])
-def test_make_passes_options_on_to_pip_and_venv(goal, extras, tmp_path):
-    words = (f"PIP_ARGS={OPTIONS}", "VENV_ARGS=--system-site-packages")
-    lines = made(tmp_path, "-n", goal, *words)
-    steps = [line for line in lines if "pip install" in line]
-    assert steps == [f'{INSTALL} --editable ".[{extra}]"' for extra in extras]
-    assert any(" -m venv --system-site-packages .venv" in line for line in lines)
 
 
 @pytest.mark.parametrize("version", [None, "2.9.1+cpu"])

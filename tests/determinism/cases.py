@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from chsel.methods import OURS, build_method, preset_settings
@@ -60,6 +61,9 @@ def _case(method="chsel", preset="default", at="bracket", **given):
     return Case(method, preset, given, body, at, **fields)
 
 
+_all = partial(_case, classes=ALL_CLASSES)
+
+
 def _on_plane(measure, plane, method="chsel", **more):
     return _case(method, at="standing", archive={"measure": measure}, plane=plane, **more)
 
@@ -68,51 +72,43 @@ _PRODUCT = {
     f"{method} {preset}": Case(method, preset, steps=2) for method in OURS for preset in PRESETS
 }
 _COSTS = {
-    "exact gradient": _case(
-        "gradient_descent", at="mallet", classes=ALL_CLASSES, cost={"gradient": "exact"}
+    "exact gradient": _all("gradient_descent", at="mallet", cost={"gradient": "exact"}),
+    "exact gradient, nearest, box": _all(
+        cost={"gradient": "exact", "lookup": "nearest", "outside": "bounding_box"}
     ),
-    "exact gradient, nearest, box": _case(
-        classes=ALL_CLASSES,
-        cost={"gradient": "exact", "lookup": "nearest", "outside": "bounding_box"},
-    ),
-    "near alpha": _case(classes=ALL_CLASSES, cost={"penetration_tolerance": -0.004}),
-    "deep alpha": _case(classes=ALL_CLASSES, cost={"penetration_tolerance": -0.02}),
+    "near alpha": _all(cost={"penetration_tolerance": -0.004}),
+    "deep alpha": _all(cost={"penetration_tolerance": -0.02}),
     "deep alpha, nearest": _case(
         "gradient_descent", "paper", cost={"penetration_tolerance": -0.018}
     ),
-    "interior, trilinear, by volume": _case(
-        classes=ALL_CLASSES,
-        cost={"free_term": "interior", "volume_normalise": True, "interior_spacing": 0.007},
+    "interior, trilinear, by volume": _all(
+        cost={"free_term": "interior", "volume_normalise": True, "interior_spacing": 0.007}
     ),
-    "all classes, dead band": _case(
-        at="mallet",
-        classes=ALL_CLASSES,
-        cost={"known_tolerance": 0.002},
-        archive={"outliers": "quantile"},
+    "all classes, dead band": _all(
+        at="mallet", cost={"known_tolerance": 0.002}, archive={"outliers": "quantile"}
     ),
     "free points alone": _case(classes=("free",)),
     "contacts alone": _case("chsel_cma_me", classes=("contacts",)),
 }
 _OTHERS = {
-    "SVGD, median": _case("svgd", classes=ALL_CLASSES, kernel="median"),
+    "SVGD, median": _all("svgd", kernel="median"),
     "ICP without an end": _case("icp", stop_below=None, iterations=60),
     "CVO, balanced": _case("cvo", at="mallet", balanced=True),
     "medial, on a plane": _case("medial_constraint_cma_me", at="standing", plane=OBLIQUE),
     "medial, one start": _case("medial_constraint", cma_es={"starts": "single"}),
-    "anchored, all classes": _case("anchored", at="mallet", classes=ALL_CLASSES),
+    "anchored, all classes": _all("anchored", at="mallet"),
     "anchored on a plane": _case("anchored", at="standing", plane=OBLIQUE),
     "anchored, free points alone": _case("anchored", classes=("free",)),
     "anchored, rounds": _case(
         "anchored", effort={"samples": 500, "kept": 4, "evaluations": 20_000}
     ),
-    "anchored, in full": _case("anchored", classes=ALL_CLASSES, steps=2, long=True),
+    "anchored, in full": _all("anchored", steps=2, long=True),
 }
 _SESSIONS = {
     "race": _case(descent={"restarts": 4, "iterations": 10, "race": [1.0, 0.5, 0.2]}),
     "two passes": _case(at="mallet", steps=2, passes=2),
     "two passes of CMA-ME": Case("chsel_cma_me", changes={"passes": 2}, body="mallet"),
-    "three steps": _case(
-        classes=ALL_CLASSES,
+    "three steps": _all(
         steps=3,
         online={
             "initial": "contact_centroid",
@@ -138,7 +134,7 @@ _PLANES = {
     "plane, descent": _case("gradient_descent", at="standing", plane=OBLIQUE),
 }
 _LONG = {
-    "long CMA-MEGA": _case(classes=ALL_CLASSES, steps=2, long=True),
+    "long CMA-MEGA": _all(steps=2, long=True),
     "long, on a plane": _on_plane("plane_position", ON_TABLE, long=True),
     "long CMA-ME": _case("chsel_cma_me", "reference", at="mallet", long=True),
     "long descent": _case("gradient_descent", "paper", at="mallet", long=True),

@@ -3,16 +3,7 @@
 import numpy as np
 import pytest
 
-from chsel.problem.noise import (
-    INDEPENDENT,
-    LATER,
-    LEVELS,
-    PRIOR_CONTACTS,
-    PRIOR_OUTLIERS,
-    WRONG,
-    estimate_noise,
-    noise_model,
-)
+from chsel.problem.noise import LEVELS, PRIOR_CONTACTS, PRIOR_OUTLIERS, estimate_noise, noise_model
 from tests.chsel.samples import plain_energy
 
 SENSOR = 0.0005
@@ -63,21 +54,3 @@ def test_levels_of_noise_are_those_of_the_sensor_and_of_all_else():
     ratios = np.diff(np.log(one.sigmas))
     np.testing.assert_allclose(ratios, ratios[0])
     assert one.sigmas[0] < 0.001 < 0.005 < one.sigmas[-1]
-
-
-def test_wrong_points_cost_a_bounded_amount_and_later_ones_less():
-    noise, none = noise_model(SENSOR), np.zeros((5, 0))
-    depths = np.zeros((5, 4))
-    depths[1, 0], depths[2, 0], depths[3, :2], depths[4] = 0.05, 0.5, 0.5, 0.5
-    costs = np.diff(noise.energies(none, depths))
-    np.testing.assert_allclose(costs, [WRONG, 0.0, LATER * WRONG, 2.0 * LATER * WRONG])
-    foreign = noise.energies(np.array([[0.0], [0.05], [0.5]]), np.zeros((3, 0)))
-    assert 5.0 < foreign[1] - foreign[0] < 9.0  # of a contact on another object
-    assert foreign[2] == pytest.approx(foreign[1], abs=0.01)
-
-
-def test_many_alike_points_count_as_few():
-    noise, count = noise_model(SENSOR), int(INDEPENDENT)
-    rows = np.random.default_rng(2).normal(0.0, 0.003, (4, count))
-    once, many = (noise.energies(np.tile(rows, (1, n)), np.zeros((4, 0))) for n in (1, 7))
-    np.testing.assert_allclose(many, once, rtol=1e-9)

@@ -7,12 +7,7 @@ from chsel.plausible.surface_distance import SQUARE_MILLIMETRES, DistanceSetting
 from chsel.problem.poses import Poses, axis_angle, compose, inverse
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import Purpose, StreamKey
-from chsel.problem.subset import (
-    farthest_points,
-    farthest_poses,
-    representative_poses,
-    surface_descriptors,
-)
+from chsel.problem.subset import farthest_points, representative_poses, surface_descriptors
 from chsel.problem.surface import surface_points
 
 GRID = SdfGrid.from_mesh(trimesh.creation.box((0.2, 0.12, 0.08)), 0.01)
@@ -68,17 +63,6 @@ def test_copies_are_chosen_once():
     chosen = representative_poses(GRID, poses, 10)
     assert sorted(chosen // 4) == [0, 1, 2]
     assert representative_poses(GRID, poses[:1], 5).tolist() == [0]
-
-
-def test_every_next_pose_is_the_farthest_from_those_before():
-    poses = Poses.of(transforms(60))
-    points, order = surface_descriptors(GRID, poses), farthest_poses(GRID, poses, 60)
-    assert order[0] == 0
-    assert sorted(order) == list(range(60))
-    squares = ((points[order][:, None] - points[None]) ** 2).sum(axis=2)
-    for n in range(1, 60):
-        nearest = squares[:n].min(axis=0)
-        assert nearest[order[n]] >= nearest.max() - 1e-12
 
 
 def test_points_far_apart_are_each_the_farthest_from_those_before():

@@ -138,23 +138,6 @@ def test_a_wrong_scale_fits_nothing(scale):
     assert (warning.code, warning.text[:38]) == ("no_fit", "no hypothesis explains the points, see")
 
 
-def test_a_sensor_less_exact_than_stated_is_a_warning():
-    known = on_box(noise=0.002)
-    trust = judged(hypotheses(POSE), 0.0001, sdf=GRID, known=known)
-    assert trust.verdict == "determined"
-    (warning,) = check_trust(trust, 0.0001)
-    assert warning.code == "above_noise"
-    assert "the sensor is less exact than 0.0001 m" in warning.text
-    assert check_trust(judged(hypotheses(POSE), sdf=GRID, known=known)) == []
-
-
-def test_known_distances_count_and_not_the_surface_alone():
-    known = at_height(0.05)
-    right = judged(TURNED_BALL, known=known, known_sdf=np.full(len(known), 0.05))
-    assert right.verdict == "determined"
-    assert judged(TURNED_BALL, known=known).verdict == "nothing fits"
-
-
 def test_free_and_occupied_points_may_be_wrong_by_a_voxel_and_a_few_by_more():
     for depth, count, fits in ((0.9, 60, True), (6.0, 3, True), (6.0, 60, False)):
         free = np.concatenate([at_height(0.05), at_height(-depth * VOXEL)[:count]])

@@ -11,7 +11,6 @@ from chsel.sensing.depth_camera import (
     main_regions,
     occlusion_edges,
     point_regions,
-    small_regions,
     speckle_free,
     valid_pixels,
 )
@@ -100,13 +99,6 @@ def test_pixels_that_do_not_count_are_in_no_region_and_connect_none():
     assert regions(np.nan_to_num(depth)).max() == 1
     diagonal = np.eye(3) * 0.5
     assert regions(diagonal, camera=PinholeCamera(3, 3, 9.0, 9.0, 1.0, 1.0)).max() == 3
-
-
-def test_small_regions_are_those_of_fewer_pixels():
-    depth = np.full((40, 60), 0.6)
-    depth[10:13, 10:13] = 0.9
-    for least, count in ((9, 0), (10, 9), (10**6, 40 * 60)):
-        assert int(small_regions(regions(depth), least).sum()) == count
 
 
 @pytest.mark.parametrize("side", [1, 9])
