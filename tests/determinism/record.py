@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import logging
 import os
 import platform
 import subprocess
@@ -107,10 +106,6 @@ def main():
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     warnings.filterwarnings("ignore", category=UserWarning, module="chsel")
-    if arguments.watch == "scribbler":
-        logging.basicConfig(stream=sys.stderr)
-        for name in ("tests", "chsel"):
-            logging.getLogger(name).setLevel(logging.DEBUG)
     kept = {body: grid(body) for body in {case.body for case in CASES.values()}}
     if arguments.again:
         for case in reversed(CASES.values()):

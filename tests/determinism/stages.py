@@ -1,6 +1,5 @@
 """What a case computes, stage by stage, so that the first stage that differs can be named."""
 
-import logging
 from functools import cache
 from pathlib import Path
 
@@ -80,25 +79,17 @@ class StageKeeper:
 
 
 class Scribbler(NullObserver):
-    """Watches every iteration, logs all it sees, and writes over what it is shown."""
+    """Watches every iteration, and writes over what it is shown."""
 
     snapshot_interval = 1
 
     def __init__(self, stages, case, step):
-        self._log = logging.getLogger(__name__)
-
-    def progress(self, stage, iteration, total):
-        """Log it."""
-        self._log.debug("%s %d of %d", stage, iteration, total)
+        pass
 
     def trace(self, stage, iteration, vectors, cost):
-        """Log it and spoil it."""
-        self._log.debug("%s %d: lowest cost %r", stage, iteration, cost.min(initial=np.inf))
         vectors[:], cost[:] = np.nan, np.nan
 
     def snapshot(self, archive):
-        """Log it and spoil it."""
-        self._log.debug("archive %d: %r", archive.iteration, archive.coverage)
         for array in (archive.lower, archive.upper, archive.solutions, archive.measures):
             array[:] = np.nan
 

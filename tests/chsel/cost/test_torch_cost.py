@@ -137,14 +137,10 @@ def test_interior_term_counts_interior_points_in_free_voxels():
 
 
 def test_volume_normalise_weighs_interior_points_by_their_voxel_share():
-    points = KnownPoints(free=[[0.0, 0.0, 0.0]])
+    points, interior = KnownPoints(free=[[0.0, 0.0, 0.0]]), replace(SETTINGS, free_term="interior")
+    by_volume = replace(interior, volume_normalise=True)
     plain, normal = (
-        RelaxedCost(
-            SPHERE,
-            points,
-            replace(SETTINGS, free_term="interior", volume_normalise=on),
-            free_resolution=0.04,
-        ).evaluate(IDENTITY)[0]
-        for on in (False, True)
+        RelaxedCost(SPHERE, points, settings, free_resolution=0.04).evaluate(IDENTITY)[0]
+        for settings in (interior, by_volume)
     )
     assert normal == pytest.approx(plain / 64)

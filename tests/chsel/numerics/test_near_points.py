@@ -39,32 +39,6 @@ def sets_of_points(draw):
     return draw(st.sampled_from(KINDS))(stream, count)
 
 
-@settings(max_examples=60, deadline=None)
-@given(points=sets_of_points())
-def test_order_is_a_permutation_and_spheres_hold_all_points_below(points):
-    tree = point_tree(points, 0.02)
-    np.testing.assert_array_equal(np.sort(tree.order), np.arange(len(points)))
-    np.testing.assert_array_equal(tree.points.T, points[tree.order])
-    count = len(tree.first)
-    blocks = tree.blocks.reshape(count, 4, LANES).astype(float)
-    below = {}
-    for block in range(count - 1, -1, -1):
-        children = tree.first[block] + np.flatnonzero(~np.isnan(blocks[block, 0]))
-        if block >= count - tree.packets:
-            below[block] = children.tolist()
-            continue
-        below[block] = []
-        for lane, child in enumerate(children):
-            places = tree.points[:, below[child]].T - tree.origin
-            x, y, z, radius = blocks[block, :, lane]
-            apart = np.sqrt(((places - (x, y, z)) ** 2).sum(axis=1)).max()
-            assert apart <= radius + 1e-6 * tree.reach
-            assert radius <= 0.5001 * np.sqrt((np.ptp(places, axis=0) ** 2).sum()) + 1e-9
-            below[block] += below[child]
-    found = [point for block in range(tree.roots) for point in below[block]]
-    assert found == list(range(len(points)))
-
-
 def test_points_in_one_finest_cell_stay_in_their_order_and_others_do_not_depend_on_it():
     stream = np.random.default_rng(1)
     centres = np.unique(on_a_lattice(stream, 300), axis=0)

@@ -104,21 +104,6 @@ def test_an_error_in_a_piece_reaches_the_caller(threads):
         parallel_for(run, 100, no_scratch)
 
 
-def test_work_may_spread_work(threads):
-    parts = np.zeros((12, 20))
-
-    def outer(first, last, _):
-        for n in range(first, last):
-
-            def inner(start, stop, _, n=n):
-                parts[n, start:stop] += n + np.arange(start, stop)
-
-            parallel_for(inner, 20, no_scratch)
-
-    parallel_for(outer, 12, no_scratch)
-    np.testing.assert_array_equal(parts, np.add.outer(np.arange(12), np.arange(20)))
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="threads inherit their rounding on Linux")
 def test_arithmetic_that_flushes_subnormals_is_refused():
     """A thread starts with the rounding of the thread that starts it."""

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from chsel.errors import MeshError, MeshWarning, SettingError
-from chsel.problem.mesh import check_bodies, clean_mesh, load_mesh, mesh_digest
+from chsel.problem.mesh import check_bodies, clean_mesh, load_mesh
 
 EXTENTS = (0.1, 0.2, 0.3)
 BOX = trimesh.creation.box(EXTENTS)
@@ -134,13 +134,3 @@ def test_sizes_up_to_the_bounds_are_accepted_and_millimetres_suspected():
     assert clean_mesh(thousandfold, BOX.faces, scale=0.001).extents == pytest.approx(EXTENTS)
     with pytest.raises(SettingError, match="mesh scale"):
         clean_mesh(BOX.vertices, BOX.faces, scale=0.0)
-
-
-def test_the_digest_names_content():
-    same = clean_mesh(BOX.vertices, BOX.faces)
-    moved = same.copy()
-    moved.vertices[0, 0] = np.nextafter(moved.vertices[0, 0], 1.0)
-    turned = trimesh.Trimesh(same.vertices, same.faces[:, [1, 2, 0]], process=False)
-    digests = [mesh_digest(mesh) for mesh in (same, moved, turned)]
-    assert digests[0] == mesh_digest(clean_mesh(BOX.vertices, BOX.faces))
-    assert len(set(digests)) == 3

@@ -10,8 +10,9 @@ from chsel.problem import defaults
 from chsel.problem.defaults import object_grid
 from chsel.problem.mesh import load_mesh
 from chsel.problem.sdf_grid import DEFAULT_NODES, mesh_sdf
+from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import surface_points
-from tests.chsel.samples import box_distance
+from tests.chsel.samples import ball_grid, box_distance
 
 SIZE = np.array([0.2, 0.12, 0.08])
 BOX = trimesh.creation.box(SIZE)
@@ -142,20 +143,6 @@ def test_beyond_the_grid_the_distance_stays_close_to_the_true_one(grid, lookup):
     np.testing.assert_allclose(gradient, [[1.0, 0.0, 0.0]])
 
 
-@pytest.mark.parametrize("lookup", ["nearest", "trilinear"])
-def test_active_cells_are_those_that_read_a_value_below_the_level(grid, lookup):
-    active = grid.active_cells(-0.01, lookup)
-    points = np.random.default_rng(4).uniform(*grid.bounds, (20_000, 3))
-    sdf, _ = grid.at(points, lookup=lookup)
-    place = (points - grid.origin) / grid.resolution
-    cell = np.rint(place) if lookup == "nearest" else np.floor(place)
-    flags = active[tuple(cell.astype(int).T)]
-    assert flags[sdf < -0.01].all()
-    if lookup == "nearest":
-        assert not flags[sdf >= -0.01].any()
-    assert 0.01 < flags.mean() < 0.3
-
-
 def test_grids_that_make_no_sense_are_refused(grid):
     spoiled = np.where(grid.values < -0.03, np.nan, grid.values)
     for values, gradients, message in (
@@ -174,3 +161,64 @@ def test_grids_that_make_no_sense_are_refused(grid):
         SdfGrid.from_mesh(BOX, 1e-5)
     with pytest.raises(SettingError, match="SDF resolution is 0"):
         SdfGrid.from_mesh(BOX, 0)
+
+
+RADIUS, RESOLUTION = 0.05, 0.01
+SIDES = np.array([0.163, 0.107, 0.089])
+COUNT = 4000
+
+
+def stream():
+    return StreamKey(0, 0).stream(Purpose.ICP_SURFACE)
+
+
+def chi_square(counts, shares):
+    """How unlike counts are to shares: mean 1 per degree of freedom, here in deviations off it."""
+    expected = counts.sum() * shares / shares.sum()
+    total, freedom = (((counts - expected) ** 2) / expected).sum(), len(counts) - 1
+    return float((total - freedom) / np.sqrt(2.0 * freedom))
+
+
+def test_points_are_on_a_sphere_and_uniform_there():
+    points = surface_points(ball_grid(RADIUS, RESOLUTION, 10), COUNT, stream())
+    distance = np.sqrt((points**2).sum(axis=1)) - RADIUS
+    assert np.abs(distance).max() < 0.02 * RESOLUTION
+    # Bands of equal height have equal areas.
+    band = np.floor((points[:, 2] / RADIUS + 1.0) / 2.0 * 8).clip(0, 7)
+    sector = np.floor((np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi) % 1.0) * 12)
+    counts = np.bincount((12 * band + sector).astype(int), minlength=96)
+    assert abs(chi_square(counts, np.ones(96))) < 3.0
+
+
+def test_points_are_on_a_box_and_uniform_there():
+    grid = SdfGrid.from_mesh(trimesh.creation.box(SIDES), RESOLUTION)
+    points = surface_points(grid, COUNT, stream())
+    distance = np.abs(box_distance(points, SIDES))
+    assert distance.max() < 0.5 * RESOLUTION  # at corners, which a grid cannot show
+    assert distance.mean() < 0.02 * RESOLUTION
+    # Of faces a centimetre off the edges, where the grid's surface is that of the box.
+    counts, areas = [], []
+    for axis in range(3):
+        u, v = (other for other in range(3) if other != axis)
+        half = SIDES[[u, v]] / 2.0 - 0.01
+        for side in (-1.0, 1.0):
+            on = np.abs(points[:, axis] - side * SIDES[axis] / 2.0) < 1e-6
+            counts.append((on & (np.abs(points[:, [u, v]]) < half).all(axis=1)).sum())
+            areas.append(half[0] * half[1])
+    assert abs(chi_square(np.array(counts), np.array(areas))) < 3.0
+    assert sum(counts) > 0.5 * COUNT
+
+
+@pytest.mark.parametrize("depth", [0.004, 1e-320])
+def test_a_single_node_inside_has_a_surface(depth):
+    values = np.full((4, 4, 4), 0.01)
+    values[1, 1, 1] = -depth
+    grid = SdfGrid(np.zeros(3), 0.01, values, np.zeros((4, 4, 4, 3)))
+    points = surface_points(grid, 200, stream())
+    assert np.abs(points - 0.01).max() < max(2.0 * depth, 1e-12)
+
+
+def test_an_object_between_the_nodes_is_refused():
+    grid = SdfGrid(np.zeros(3), 0.01, np.full((4, 4, 4), 0.01), np.zeros((4, 4, 4, 3)))
+    with pytest.raises(SdfError, match="no node of the SDF grid is inside"):
+        surface_points(grid, 3, stream())

@@ -2,13 +2,26 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation, Slerp
 
 from chsel import KnownPoints, SdfGrid
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.objective import Objective
-from chsel.errors import SettingError
-from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, rotation_vector
+from chsel.errors import PoseError, SettingError
+from chsel.problem.poses import (
+    Poses,
+    apply,
+    axis_angle,
+    check_rigid,
+    compose,
+    interpolated,
+    inverse,
+    nearest_rigid,
+    quaternions,
+    random_rotations,
+    rotation_matrices,
+    rotation_vector,
+)
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space
 from chsel.qd.measures import MEASURES, measure_named
 from tests.chsel.problem.torch_spaces import decode
@@ -33,18 +46,13 @@ def test_nine_numbers_and_transforms_are_inverse_to_each_other():
 
 
 def test_plane_pose_of_a_tilted_rotation_is_the_nearest_by_frobenius():
-    axis = np.array(TILTED.axis)
     tilt = axis_angle(np.array([0.8, 0.0, 0.6]), np.deg2rad(10.0))
-    for theta in np.linspace(-3.0, 3.0, 9):
-        rotation = axis_angle(axis, theta) @ tilt
+    angles = np.linspace(-np.pi, np.pi, 20_001)
+    turns = axis_angle(np.tile(TILTED.axis, (len(angles), 1)), angles)
+    for rotation in turns[::2222] @ tilt:
         found = TILTED.encode(Poses.of(compose(rotation, np.zeros(3))[None]))[0, 0]
-
-        def distance(angle, rotation=rotation):
-            return float(((axis_angle(axis, angle) - rotation) ** 2).sum())
-
-        best = minimize_scalar(distance, bracket=(theta - 0.3, theta, theta + 0.3), tol=1e-12).x
-        turns = (found - best) / (2 * np.pi)
-        assert abs(turns - round(turns)) * 2 * np.pi < 1e-6
+        best = angles[((turns - rotation) ** 2).sum(axis=(1, 2)).argmin()]
+        assert np.cos(found - best) > np.cos(4e-4)
 
 
 def test_plane_poses_survive_encoding_and_stay_on_the_plane():
@@ -149,3 +157,46 @@ def test_a_measure_of_the_other_space_names_those_that_fit():
         measure_named("plane_angle", planar=False)
     with pytest.raises(SettingError, match=r"only without plane; accepted: .*plane_position"):
         measure_named("rotation_3", planar=True)
+
+
+def test_transforms_that_are_not_rigid_are_named():
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    check_rigid("poses", poses)
+    for row, column, value in ((0, 0, 1.1), (0, 0, -1.0), (3, 0, 0.5)):
+        broken = poses.copy()
+        broken[2, row, column] = value
+        with pytest.raises(PoseError, match=r"poses\[2\] is not a rigid transform"):
+            check_rigid("poses", broken)
+    rounded = np.round(poses + 1e-5 * np.arange(16).reshape(4, 4) * (np.arange(4)[:, None] < 3), 7)
+    check_rigid("poses", nearest_rigid("poses", rounded))
+
+
+def test_quaternions_and_rotations_are_each_others_inverse():
+    r = random_rotations(np.random.default_rng(0), 100)
+    r = np.concatenate([r, np.eye(3)[None], axis_angle(np.eye(3), np.full(3, np.pi))])
+    np.testing.assert_allclose(rotation_matrices(quaternions(r)), r, atol=1e-14)
+
+
+def test_turns_are_those_of_scipy_and_positions_on_a_line():
+    first, second = random_rotations(np.random.default_rng(1), 2)
+    t = np.array([0.0, 0.1, 0.5, 0.9, 1.0])
+    ends = np.tile(compose(first, np.array([1.0, 2.0, 3.0])), (5, 1, 1))
+    others = np.tile(compose(second, np.array([2.0, 0.0, 3.0])), (5, 1, 1))
+    between = interpolated(ends, others, t)
+    expected = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([first, second])))(t)
+    np.testing.assert_allclose(between[:, :3, :3], expected.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(between[:, :3, 3], [[1 + s, 2 - 2 * s, 3] for s in t], atol=1e-15)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, np.pi])
+def test_half_of_a_turn_is_half_its_angle(angle):
+    rotation = random_rotations(np.random.default_rng(2), 1)[0]
+    axis = np.array([0.6, 0.0, 0.8])
+    start, half, turned = (
+        compose(axis_angle(axis, part * angle) @ rotation, np.zeros(3))[None]
+        for part in (0.0, 0.5, 1.0)
+    )
+    found = interpolated(start, turned, np.array([0.5]))
+    if angle == np.pi:  # either way round is as short
+        found, half = interpolated(found, turned, np.array([1.0])), turned
+    np.testing.assert_allclose(found, half, atol=1e-12)
