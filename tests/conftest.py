@@ -1,4 +1,4 @@
-"""Where tests find the optional data directory."""
+"""What tests share: optional data, threads, signals, and the order of files."""
 
 import os
 import signal
@@ -39,6 +39,14 @@ def interruptible():
     previous = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, previous)
+
+
+@pytest.fixture(params=[1, 2, 3])
+def threads(request):
+    """How many threads kernels take, in turn."""
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

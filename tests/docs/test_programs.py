@@ -21,6 +21,7 @@ from tests.runners.in_process import run
 
 pytestmark = pytest.mark.slow
 BLOCK = re.compile(r"^```(?P<language>\w+)\n(?P<text>.*?)^```$", re.DOTALL | re.MULTILINE)
+RECORDINGS = "logs/probe/*/recording.mcap"
 NAMED = re.compile(r"`(?P<name>[\w./-]+\.\w+)`:\n\n\Z")
 
 
@@ -58,10 +59,6 @@ def followed(page, folder):
     return folder
 
 
-def recordings(folder):
-    return sorted(folder.glob("logs/probe/*/recording.mcap"))
-
-
 def test_a_program_that_knows_nothing_of_this_package_is_ranked(tmp_path):
     followed("outside_methods.md", tmp_path)
     (program,) = tmp_path.glob("*.py")
@@ -83,7 +80,7 @@ def test_a_program_that_knows_nothing_of_this_package_is_ranked(tmp_path):
 def method(tmp_path_factory):
     """A folder in which everything on the page was done, and its recordings by their rounds."""
     folder = followed("writing_a_method.md", tmp_path_factory.mktemp("method"))
-    read = map(read_recording, recordings(folder))
+    read = map(read_recording, folder.glob(RECORDINGS))
     return folder, {one.start.config["method"]["rounds"]: one for one in read}
 
 
@@ -144,7 +141,7 @@ def test_what_is_no_method_is_one_line(tmp_path):
 def test_a_policy_decides_as_its_page_says_and_not_without_the_package(tmp_path):
     """The first probe is by entropy, and those after it by information."""
     folder = followed("writing_a_policy.md", tmp_path)
-    (path,) = recordings(folder)
+    (path,) = folder.glob(RECORDINGS)
     read = read_recording(path)
     group = read.start.config["policy"]
     assert (group["name"], group["first"]) == ("entropy_first", 1)

@@ -38,7 +38,6 @@ def test_every_preset_survives_the_way_through_a_mapping(method):
         ({"cots": {}}, r"method.cots does not exist; did you mean cost\? accepted: archive, cost"),
         ({"cost": {"free_scale": "x"}}, r"method.cost.free_scale is 'x'; accepted: a number"),
         ({"passes": True}, r"method.passes is True; accepted: an integer"),
-        ({"cost": 3}, r"method.cost is 3; accepted: a group"),
         ({"cost": {"lookup": None}}, r"method.cost.lookup is None; accepted: a text"),
         ({"plane": {"axis": [0, 1], "offset": 0}}, r"method.plane.axis has 2 entries; accepted: 3"),
         ({"archive": {"bins": 0}}, r"method.archive: bins is 0"),
@@ -69,12 +68,10 @@ class Checked(CheckedSettings):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"rate": 0.0}, "rate is 0.0; accepted: a finite number above 0"),
         ({"rate": float("nan")}, "rate is nan; accepted: a finite number above 0"),
         ({"count": -1}, "count is -1; accepted: a finite number of at least 0"),
         ({"count": 1_001}, "count is 1001; accepted: at most 1_000"),
         ({"length": 20.0}, r"length is 20.0; accepted: 0.001 to 10 (m)"),
-        ({"name": "c"}, "name is 'c'; accepted: a, b"),
         ({"limit": 6.0}, "limit is 6.0; accepted: at most 5.0"),
         ({"limit": 0.5}, "rate is 1.0; accepted: at most limit"),
         ({"limit": 0.5, "name": "c"}, "name is 'c'; accepted: a, b"),

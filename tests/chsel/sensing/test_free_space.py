@@ -146,14 +146,11 @@ def test_voxels_are_free_once_enough_views_saw_them():
     assert len(free.new()) == free.count - 11 == 11
 
 
-def test_a_grid_too_large_is_refused_with_both_numbers():
+def test_sizes_shapes_and_poses_that_do_not_fit_are_refused():
     with pytest.raises(SettingError, match=r"0\.4 x 0\.4 x 0\.29 m .* 4\.644e\+10 .*200_000_000"):
         FreeGrid(WORKSPACE, 0.0001)
     with pytest.raises(SettingError, match="views is 251; accepted"):
         grid(views=251)
-
-
-def test_shapes_and_poses_that_do_not_fit_are_refused():
     free = grid()
     with pytest.raises(PointsError, match=r"depth has shape \(64, 48\); accepted: \(48, 64\)"):
         free.from_depth(DEPTH.T, CAMERA, POSE, MASK)
@@ -284,15 +281,9 @@ def test_poses_that_hardly_move_are_thinned():
     np.testing.assert_array_equal(way[[0, -1]], poses[[0, -1]])
     for count, left in ((100, 2), (1, 1), (0, 0)):
         assert len(poses_between(poses[:count], step=0.01, radius=0.2)) == left
-
-
-def test_poses_too_far_apart_are_refused():
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    poses[1, 0, 3] = 1e9
+    poses[-1, 0, 3] = 1e9
     with pytest.raises(PoseError, match=r"1e\+09 m.*accepted: at most 1_000_000"):
         poses_between(poses, step=0.005, radius=0.1)
-    with pytest.raises(PoseError, match=r"poses\[1\] is not a rigid transform"):
-        poses_between(np.stack([np.eye(4), 2.0 * np.eye(4)]), step=0.005, radius=0.1)
 
 
 @pytest.mark.parametrize("turned", [0.0, 3.0])
