@@ -2,8 +2,6 @@
 
 import ast
 import re
-import subprocess
-import sys
 from collections import Counter
 
 import pytest
@@ -154,9 +152,3 @@ def test_an_arrow_back_up_and_a_circle_inside_a_folder_are_seen(tmp_path):
     assert len(found) == len(ABOVE)
     (circle,) = circles(plant(tmp_path / "other", CIRCLE))
     assert circle == ["chsel.cost.d", "chsel.cost.e", "chsel.cost.f"]
-
-
-def test_nothing_imports_the_physics_engine_before_it_is_needed():
-    code = "import sys, runners.probe, runners.sessions; print('pybullet' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"

@@ -33,28 +33,13 @@ def test_a_mesh_and_points_are_all_it_takes():
     assert np.abs(best[:3, 3] - POSE[:3, 3]).max() < 0.005
 
 
-def test_a_grid_a_mesh_lists_and_tensors_give_the_same_bits():
+def test_a_grid_that_is_kept_a_mesh_lists_and_tensors_give_the_same_bits(monkeypatch):
     grid = chsel.SdfGrid.from_mesh(BOX, 0.002)
     digest = register(surface=SURFACE).digest
     assert register(surface=SURFACE.tolist()).digest == digest
     assert chsel.register(grid, surface=SURFACE, method="chsel", settings=QUICK).digest == digest
-    assert register(surface=SURFACE, seed=1).digest != digest
-
-
-@pytest.mark.filterwarnings("ignore:the SDF grid of an object:chsel.MeshWarning")
-def test_a_thin_plate_is_found_and_its_grid_is_made_once(monkeypatch):
-    monkeypatch.setattr("chsel.problem.sdf_grid.DEFAULT_NODES", 40_000)
-    plate = trimesh.creation.box((0.1, 0.06, 0.002))
-    touched = trimesh.sample.sample_surface(plate, 40, seed=0)[0]
-    rim = np.array([[0.05, 0.01, 0.0], [0.05, -0.02, 0.0], [-0.05, 0.01, 0.0], [0.01, 0.03, 0.0]])
-    surface = apply(POSE, np.concatenate([touched, rim]))
-    found = chsel.register(plate, surface=surface, method="anchored")
-    corners = apply(found.object_from_world[0], apply(POSE, np.asarray(plate.vertices)))
-    expected = np.tile(plate.extents / 2.0, (8, 1))  # after half turns, too
-    np.testing.assert_allclose(np.abs(corners), expected, atol=5e-4)
     monkeypatch.setattr("chsel.problem.sdf_grid.mesh_sdf", None)
-    again = chsel.register(plate, surface=surface, method="anchored")
-    assert again.digest == found.digest
+    assert register(surface=SURFACE, seed=1).digest != digest
 
 
 def test_points_added_later_start_from_the_previous_result():
@@ -141,7 +126,6 @@ def test_points_far_off_all_poses_give_one_warning():
     [
         ({}, "no point was given; accepted: surface, free"),
         ({"surface": 1000.0 * SURFACE}, r"the object is 0\.1.* m: are they in mill"),
-        ({"free": [[0, 0]]}, r"free has shape \(1, 2\); accepted: \(any, 3\)"),
         ({"known": POINT}, "known has 1 points and known_sdf 0"),
         ({"method": "magic"}, "method is 'magic'; accepted: chsel"),
         ({"method": "anchored"}, "method=anchored: settings"),

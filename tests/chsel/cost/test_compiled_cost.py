@@ -225,18 +225,6 @@ def test_by_default_alpha_is_a_quarter_of_a_free_voxel_or_half_of_the_greatest_d
         assert CostSettings().of_object(sdf, resolution).alpha == pytest.approx(alpha)
 
 
-def summed_over_all(cost, sdf, free, pose):
-    """Eq. 8 over every free point, one after the other in the order of the tree."""
-    x, y, z = free[cost.model.free.tree.order].T
-    moved = [
-        pose[3 * i] * x + pose[3 * i + 1] * y + pose[3 * i + 2] * z + pose[9 + i] for i in range(3)
-    ]
-    changes = cost.settings
-    s, _ = sdf.at(np.stack(moved, axis=1), lookup=changes.lookup, outside=changes.outside)
-    violation = np.maximum(changes.penetration_tolerance - s, 0.0)
-    return float(np.add.accumulate(changes.free_scale * violation)[-1])
-
-
 ON_LATTICE = ((np.argwhere(np.ones((59, 59, 59))) - 29) * 0.005)[:200_000]
 SCATTERED = np.random.default_rng(3).uniform(-0.2, 0.2, (200_000, 3))
 
@@ -244,17 +232,14 @@ SCATTERED = np.random.default_rng(3).uniform(-0.2, 0.2, (200_000, 3))
 @pytest.mark.parametrize(
     ("free", "lookup"), [(ON_LATTICE, "nearest"), (ON_LATTICE, "trilinear"), (SCATTERED, "nearest")]
 )
-def test_200_000_free_points_cost_to_the_bit_what_their_sum_one_by_one_is(free, lookup):
+def test_200_000_free_points_cost_to_the_bit_what_they_cost_without_culling(free, lookup):
     transforms = random_poses(np.random.default_rng(4), 5, 0.2)
     transforms[0] = np.eye(4)
     poses = Poses.of(transforms)
     case = Case("l_shape", KnownPoints(free), CostSettings(lookup=lookup), 0.005, posed(transforms))
-    culled = case.cost()
-    costs = culled.costs(poses)
+    costs = case.cost().costs(poses)
     assert costs[0] > 1.0
     assert_same_bits(costs, case.cost(culling="none").costs(poses))
-    sums = [summed_over_all(culled, grid_of("l_shape"), free, pose) for pose in poses.numbers]
-    assert_same_bits(costs, sums)
 
 
 def border_points(sdf):
@@ -356,9 +341,6 @@ def test_tolerance_deeper_than_the_object_is_a_warning_and_costs_free_points_not
     with pytest.warns(UserWarning, match="cannot be violated"):
         cost = made(grid_of("box"), KnownPoints(free), changes)
     assert cost.evaluate(np.eye(4)[None])[0] == 0.0
-    if made is CompiledCost:
-        vectors = posed(np.eye(4)[None])
-        assert_same_bits(Objective(cost, SE3Space()).descended(vectors, 1.0, 0.01, 5), vectors)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         made(grid_of("box"), KnownPoints(known=free), changes)

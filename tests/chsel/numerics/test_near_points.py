@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chsel.errors import PointsError
 from chsel.numerics.cell_set import box_of, cell_set_of, squared_clearances
 from chsel.numerics.near_points import LANES, gather, near_points_for, point_tree, select, to_cells
 
@@ -114,11 +113,6 @@ def test_few_points_are_gathered_about_a_small_set():
     inside = (np.abs(points[tree.order]) < 0.01).all(axis=1).sum()
     assert 0 < inside <= len(selected) < 1.1 * inside + 1
     assert len(gathered) < 2 * 27 * inside  # neighbouring cells are 0 away, too
-
-
-def test_points_whose_extent_is_infinite_are_refused():
-    with pytest.raises(PointsError, match="accepted: a finite extent"):
-        point_tree(np.array([[-1.5e308, 0.0, 0.0], [1.5e308, 0.0, 0.0]]), 0.01)
 
 
 @pytest.mark.parametrize("gap", [1, 2])

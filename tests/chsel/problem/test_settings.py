@@ -37,7 +37,6 @@ def test_every_preset_survives_the_way_through_a_mapping(method):
     [
         ({"cots": {}}, r"method.cots does not exist; did you mean cost\? accepted: archive, cost"),
         ({"cost": {"free_scale": "x"}}, r"method.cost.free_scale is 'x'; accepted: a number"),
-        ({"passes": True}, r"method.passes is True; accepted: an integer"),
         ({"cost": {"lookup": None}}, r"method.cost.lookup is None; accepted: a text"),
         ({"plane": {"axis": [0, 1], "offset": 0}}, r"method.plane.axis has 2 entries; accepted: 3"),
         ({"archive": {"bins": 0}}, r"method.archive: bins is 0"),

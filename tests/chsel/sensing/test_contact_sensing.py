@@ -101,7 +101,6 @@ def test_shares_are_in_proportion_and_sum_up(counts, most):
 
 
 def test_shares_by_hand():
-    assert share([30, 10], 50) == [30, 10]
     assert share([300, 100], 50) == [38, 12]  # 37.5 and 12.5: the first among equals
     assert share([1, 1, 98], 50) == [1, 0, 49]
 
