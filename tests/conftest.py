@@ -1,10 +1,7 @@
-"""Where tests find the optional data directory."""
-
-from __future__ import annotations
+"""What tests share: optional data, threads, signals, and the order of files."""
 
 import os
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,7 +20,7 @@ settings.load_profile("fixed")
 torch.set_num_threads(1)  # two threads on two busy cores are many times slower
 
 
-def _optional_data(part: str) -> Path:
+def _optional_data(part):
     """The folder `part` of the directory CHSEL_DATA, by default `shared` beside the checkout."""
     directory = Path(os.environ.get("CHSEL_DATA", REPOSITORY.parent / "shared")) / part
     if not directory.is_dir():
@@ -31,26 +28,34 @@ def _optional_data(part: str) -> Path:
     return directory
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     """Take the longest files first, for `-n 2 --dist loadfile --no-loadscope-reorder`."""
     items.sort(key=lambda item: not item.nodeid.startswith(LONGEST))
 
 
 @pytest.fixture
-def interruptible() -> Iterator[None]:
+def interruptible():
     """Child processes can be sent SIGINT, also where a shell has started the tests ignoring it."""
     previous = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, previous)
 
 
+@pytest.fixture(params=[1, 2, 3])
+def threads(request):
+    """How many threads kernels take, in turn."""
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(1)
+
+
 @pytest.fixture(scope="session")
-def ycb_directory() -> Path:
+def ycb_directory():
     """Real scans, laid out as the official archives: OBJECT/google_16k/nontextured.ply."""
     return _optional_data("ycb")
 
 
 @pytest.fixture(scope="session")
-def real_directory() -> Path:
+def real_directory():
     """Real touch measurements with their meshes."""
     return _optional_data("real")

@@ -1,20 +1,25 @@
-"""Grids, poses and results that tests share."""
-
-from __future__ import annotations
+"""Grids, poses, results, and the files of kernels that tests share."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 
-from chsel.numerics.arrays import FloatArray
-from chsel.problem.noise import EXTENT, INDEPENDENT, LATER, SHARE, NoiseModel
-from chsel.problem.points import KnownPoints
-from chsel.problem.poses import Poses, apply, compose, random_rotations
+from chsel.problem.noise import EXTENT, INDEPENDENT, LATER, SHARE
+from chsel.problem.poses import apply, compose, random_rotations
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.sdf_grid import SdfGrid
 
+REPOSITORY = Path(__file__).resolve().parents[2]
 
-def ball_grid(radius: float, resolution: float, half: int) -> SdfGrid:
+
+def kernel_files():
+    """The files of `chsel` that import the compiler of kernels."""
+    files = (REPOSITORY / "chsel").rglob("*.py")
+    return sorted(file for file in files if "from chsel.numerics.compiler" in file.read_text())
+
+
+def ball_grid(radius, resolution, half):
     """The exact distance to a ball around the origin, `half` nodes to every side of it."""
     nodes = np.moveaxis(np.indices((2 * half + 1,) * 3), 0, -1) * resolution - half * resolution
     distance = np.sqrt((nodes**2).sum(axis=-1))
@@ -23,18 +28,17 @@ def ball_grid(radius: float, resolution: float, half: int) -> SdfGrid:
     return SdfGrid(np.full(3, -half * resolution), resolution, distance - radius, gradient)
 
 
-def box_distance(points: FloatArray, sides: FloatArray) -> FloatArray:
+def box_distance(points, sides):
     """Signed distances (...) of points (..., 3) to a box around the origin."""
     beyond = np.abs(points) - 0.5 * sides
     outside = np.sqrt((np.maximum(beyond, 0.0) ** 2).sum(axis=-1))
-    distance: FloatArray = outside + np.minimum(beyond.max(axis=-1), 0.0)
-    return distance
+    return outside + np.minimum(beyond.max(axis=-1), 0.0)
 
 
-def plain_energy(noise: NoiseModel, residuals: FloatArray, depths: FloatArray) -> float:
+def plain_energy(noise, residuals, depths):
     """E of one pose as chsel.problem.noise has it, of residuals (N,) and depths (M,), metres."""
 
-    def density(size: float, sigma: float) -> float:
+    def density(size, sigma):
         normal = math.exp(-0.5 * (size / sigma) ** 2) / (math.sqrt(2.0 * math.pi) * sigma)
         return (1.0 - SHARE) * normal + SHARE / EXTENT
 
@@ -55,9 +59,7 @@ def plain_energy(noise: NoiseModel, residuals: FloatArray, depths: FloatArray) -
     return -most - math.log(sum(math.exp(one - most) for one in logs)) + power * wrong
 
 
-def plain_energies(
-    noise: NoiseModel, sdf: SdfGrid, points: KnownPoints, poses: Poses
-) -> FloatArray:
+def plain_energies(noise, sdf, points, poses):
     """The same (B,) of poses, by distances between the nodes of a grid."""
     energies = []
     for pose in poses.matrices:
@@ -71,13 +73,13 @@ def plain_energies(
     return np.array(energies)
 
 
-def random_poses(stream: np.random.Generator, count: int, reach: float) -> FloatArray:
+def random_poses(stream, count, reach):
     """Transforms (count, 4, 4) of any rotation, translated by at most `reach` along each axis."""
     rotations = random_rotations(stream, count)
     return compose(rotations, stream.uniform(-reach, reach, (count, 3)))
 
 
-def hypotheses_at(object_from_world: FloatArray, duplicate: list[bool] | None = None) -> Hypotheses:
+def hypotheses_at(object_from_world, duplicate=None):
     """A result of poses (B, 4, 4) at the costs 0, 1, 2, ..., from no archive."""
     count = len(object_from_world)
     return Hypotheses(

@@ -1,20 +1,15 @@
 """What is decided: every policy in scenes of stored numbers, and the parts of their forecasts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 
 from chsel.next_probe.decision_problem import Actions, Belief, DecisionProblem, HandShape
 from chsel.next_probe.forecast import BeliefSettings, Forecast, belief_before, surprise
-from chsel.numerics.arrays import FloatArray
 from chsel.policies import OURS, build_policy
 from chsel.problem.poses import axis_angle, compose, inverse, product, random_rotations
-from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import Purpose, StreamKey, normals, uniforms
-from tests.determinism.problems import scene
-from tests.determinism.stages import Stages, keep
+from tests.determinism.stages import keep, scene
 
 SCENES = ("bracket", "mallet")
 KEY = StreamKey(11, 3)
@@ -24,21 +19,19 @@ _FACES = ((0, 1, 2), (0, 2, 3), (0, 4, 1), (1, 4, 2), (2, 4, 3), (3, 4, 0))  # o
 _HAND = ((-0.03, -0.01, 0.0), (0.03, -0.01, 0.0), (0.03, 0.01, 0.0), (-0.03, 0.01, 0.0))
 
 
-def decision_stages(place: str, sdf: SdfGrid) -> dict[str, Stages]:
+def decision_stages(place, sdf):
     """By case: the forecast of a scene, then the decision of every policy about it."""
     problem = posed(place, sdf)
-    stages: Stages = {}
-    parts = problem.belief.object_from_world, problem.belief.weights
-    keep(stages, "belief before", {"poses": parts[0].copy(), "weights": parts[1].copy()})
-    problem = replace(problem, belief=_scattered(place, sdf))
+    stages, belief = {}, problem.belief
+    parts = {"poses": belief.object_from_world.copy(), "weights": belief.weights.copy()}
+    keep(stages, "belief before", parts)
+    problem = replace(problem, belief=_scattered(problem.workspace))
     forecast = Forecast(problem, 0.005)
     keep(stages, "hand", {"heights": problem.hand.front.heights.copy()})
     keep(stages, "first contacts", forecast.first._asdict())
-    chances = {"hit": forecast.hit_chance, "blocked": forecast.blocked_chance}
-    keep(stages, "chances", chances)
-    keep(
-        stages, "distances", {"between": forecast.distances, "spread": np.array([forecast.spread])}
-    )
+    keep(stages, "chances", {"hit": forecast.hit_chance, "blocked": forecast.blocked_chance})
+    spread = {"between": forecast.distances, "spread": np.array([forecast.spread])}
+    keep(stages, "distances", spread)
     keep(stages, "gains", forecast.gains._asdict())
     cases = {f"forecast, {place}": stages}
     for name in OURS:
@@ -46,34 +39,31 @@ def decision_stages(place: str, sdf: SdfGrid) -> dict[str, Stages]:
         decision = policy.decide(problem)
         names = ("score", "expected_spread", "contacts")
         arrays = {name: getattr(decision, name) for name in names}
-        outcomes = (None, decision.contacts[0], decision.contacts[0] + 0.02)
-        outcomes = [o if o is None else np.nan_to_num(o) for o in outcomes]
+        first = decision.contacts[0]
+        outcomes = (None, np.nan_to_num(first), np.nan_to_num(first + 0.02))
         nats = [surprise(problem, decision, 0.005, outcome) for outcome in outcomes]
         arrays |= {"chosen": np.array([float(decision.chosen)]), "surprise": np.array(nats)}
         cases[f"{name}, {place}"] = {"decision": arrays}
     return cases
 
 
-def posed(place: str, sdf: SdfGrid) -> DecisionProblem:
+def posed(place, sdf):
     """A scene before any registration: actions along an axis and obliquely, a pyramid as hand."""
-    where = scene(sdf, place, ("contacts", "free"))
-    belief = belief_before(sdf, where.points, where.workspace, KEY, BeliefSettings(poses=_POSES))
-    lower, upper = where.workspace.bounds
+    points, workspace, resolution = scene(place, ("contacts", "free"))
+    belief = belief_before(sdf, points, workspace, KEY, BeliefSettings(poses=_POSES))
+    lower, upper = workspace.bounds
     stream = KEY.stream(Purpose.PLAUSIBLE_ROTATIONS)
     starts = uniforms(stream, lower, upper, (2 * _STARTS, 3))
     turned = axis_angle(np.array([0.36, 0.48, 0.8]), np.array(0.7))
     turns = np.repeat([np.eye(3), turned], _STARTS, axis=0)
     starts = starts - 0.5 * (upper - lower).max() * turns[:, :, 2]
-    actions = Actions(
-        compose(turns, starts),
-        uniforms(stream, 0.2, 0.8, len(starts)),
-        uniforms(stream, 1.0, 3.0, len(starts)),
-    )
+    lengths = uniforms(stream, 0.2, 0.8, len(starts))
+    actions = Actions(compose(turns, starts), lengths, uniforms(stream, 1.0, 3.0, len(starts)))
     return DecisionProblem(
         sdf=sdf,
-        points=where.points,
-        workspace=where.workspace,
-        free_resolution=where.free_resolution,
+        points=points,
+        workspace=workspace,
+        free_resolution=resolution,
         belief=belief,
         actions=actions,
         available=np.arange(len(starts)) % 5 != 1,
@@ -82,11 +72,10 @@ def posed(place: str, sdf: SdfGrid) -> DecisionProblem:
     )
 
 
-def _scattered(place: str, sdf: SdfGrid) -> Belief:
+def _scattered(workspace):
     """Poses around one in the middle of the workspace, of unequal weights."""
-    where = scene(sdf, place, ("contacts", "free"))
     stream = KEY.stream(Purpose.WALKS)
-    middle: FloatArray = 0.5 * (where.workspace.bounds[0] + where.workspace.bounds[1])
+    middle = 0.5 * (workspace.bounds[0] + workspace.bounds[1])
     few = axis_angle(np.array([0.0, 0.6, 0.8]), uniforms(stream, -0.4, 0.4, _POSES))
     turns = product(few, random_rotations(stream, 1))
     poses = inverse(compose(turns, middle + 0.02 * normals(stream, (_POSES, 3))))

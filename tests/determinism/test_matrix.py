@@ -1,8 +1,5 @@
 """The same bits on every thread count, CPU and library, whoever watches: against golden.json."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -17,47 +14,40 @@ from chsel.qd.emitters import SEARCHES
 from chsel.qd.measures import MEASURES
 from replay.comparing.differences import ulps
 from tests.determinism.cases import CASES
-from tests.determinism.comparison import condensed, differences, other_versions, read_golden
-from tests.determinism.environments import ENVIRONMENTS
-from tests.determinism.stages import Stages
+from tests.determinism.record import ENVIRONMENTS, HAS_FMA, condensed, recorded
+from tests.tools.golden import differences, other_versions, read_golden
 
-Record = tuple[dict[str, Stages], dict[str, str]]
+DEFAULT, *OTHERS = ENVIRONMENTS
 
 
 @pytest.fixture(scope="module")
-def record_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Record]:
+def record_of(tmp_path_factory):
     """What a setting gives, in a process of its own, each once."""
     directory = tmp_path_factory.mktemp("records")
-    return cache(lambda name: ENVIRONMENTS[name].record(directory / name.replace(" ", "_")))
+    return cache(lambda name: recorded(ENVIRONMENTS[name], directory / f"{name}.json"))
 
 
-OTHERS = [pytest.param(name, marks=pytest.mark.slow) for name in list(ENVIRONMENTS)[1:]]
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in OTHERS]
 
 
-@pytest.mark.parametrize("name", ["default", *OTHERS])
-def test_every_bit_is_as_in_the_golden_file(name: str, record_of: Callable[[str], Record]) -> None:
-    usual, _ = record_of("default")
-    record, _ = record_of(name)
-    found = differences(read_golden(), record, usual)
+@pytest.mark.parametrize("name", [DEFAULT, *SLOW])
+def test_every_bit_is_as_in_the_golden_file(name, record_of):
+    whole = "--watch" not in ENVIRONMENTS[name][1]
+    found = differences(read_golden(), record_of(name)[0], whole=whole)
     packages = other_versions()
     hint = f"golden.json was made with other packages: here {packages}\n" if packages else ""
     assert not found, f"setting {name!r}: {len(found)} cases differ\n{hint}" + "\n".join(found)
 
 
 @pytest.mark.slow
-def test_the_settings_for_other_cpus_do_reach_the_compiler(
-    record_of: Callable[[str], Record],
-) -> None:
+@pytest.mark.skipif(not HAS_FMA, reason="this CPU lacks AVX2 or FMA")
+def test_the_settings_for_other_cpus_do_reach_the_compiler(record_of):
     """By a kernel that is compiled as no kernel of chsel is: it fuses where the CPU can."""
-    generic, haswell = list(ENVIRONMENTS)[1:3]
-    if not ENVIRONMENTS[haswell].variables:
-        pytest.skip("this CPU lacks AVX2 or FMA")
-    names = ("default", generic, haswell)
-    usual, plain, fused = (record_of(name)[1]["fused kernels"] for name in names)
+    usual, plain, fused = (record_of(name)[1] for name in (DEFAULT, *OTHERS[:2]))
     assert plain != usual == fused
 
 
-def test_the_cases_meet_every_choice_at_least_once() -> None:
+def test_the_cases_meet_every_choice_at_least_once():
     settings = [case.build().settings for case in CASES.values()]
     searches = [made for made in settings if isinstance(made, ChselSettings)]
     every = [getattr(made, "cost", None) for made in settings]
@@ -78,42 +68,32 @@ def test_the_cases_meet_every_choice_at_least_once() -> None:
     assert {made.plane is not None for made in searches} == {True, False}
 
 
-def _one_bit_off(record: dict[str, Stages], case: str, stage: str, part: str) -> dict[str, Stages]:
-    stages = {**record[case], stage: {**record[case][stage]}}
-    array = stages[stage][part].copy()
-    array.flat[-1] = np.nextafter(array.flat[-1], np.inf)
-    stages[stage][part] = array
-    return {**record, case: stages}
+def test_one_wrong_bit_is_found_and_said_where():
+    costs, result = "step 0: costs of E_0", "step 0: hypotheses"
+
+    def record(last_cost=3.0, cell=4):
+        stages = {costs: {"costs": np.array([1.0, 2.0, last_cost])}}
+        stages[result] = {"cost": np.array([0.5, 0.0]), "cell": np.array([3, cell])}
+        return condensed(stages)
+
+    golden = {"case": record()}
+    assert differences(golden, {"case": record()}) == []
+    one_bit = record(np.nextafter(3.0, 4.0), cell=5)
+    found = differences(golden, {"case": one_bit})
+    assert found == [f"case: {costs!r} differs, by up to 1 ulp in samples"]
+    found = differences(golden, {"case": record(cell=5)})
+    assert found == [f"case: {result!r} differs, but not in samples"]
+    for stage, whole, found in (
+        (costs, True, [f"case: stage {costs!r} is missing"]),
+        (costs, False, []),
+        (result, False, [f"case: stage {result!r} is missing"]),
+    ):
+        left = {name: row for name, row in record().items() if name != stage}
+        assert differences(golden, {"case": left}, whole=whole) == found
+    assert differences(golden, {}) == ["case: not recorded"]
 
 
-def test_one_wrong_bit_is_found_and_said_where() -> None:
-    stages: Stages = {
-        "step 0: costs of E_0": {"costs": np.array([1.0, 2.0, 3.0])},
-        "step 0: hypotheses": {"cost": np.array([0.5, 0.0]), "cell": np.array([3, 4])},
-    }
-    record = {"first": stages, "second": stages}
-    golden = condensed(record)
-    assert differences(golden, record, record) == []
-    wrong = _one_bit_off(record, "second", "step 0: hypotheses", "cost")
-    assert differences(golden, wrong, record) == [
-        "second: 'step 0: hypotheses' differs, 1 of 2 cost by up to 1 ulp"
-    ]
-    wrong = _one_bit_off(wrong, "second", "step 0: costs of E_0", "costs")
-    assert differences(golden, wrong, record) == [
-        "second: 'step 0: costs of E_0' differs, 1 of 3 costs by up to 1 ulp"
-    ]
-    assert differences(golden, wrong, wrong) == [
-        "second: 'step 0: costs of E_0' differs, by up to 1 ulp in the numbers in golden.json"
-    ]
-    unfinished = {
-        "first": stages,
-        "second": {"step 0: costs of E_0": stages["step 0: costs of E_0"]},
-    }
-    assert differences(golden, unfinished) == ["second: stage 'step 0: hypotheses' is missing"]
-    assert differences(golden, {"first": stages}) == ["second: not recorded"]
-
-
-def test_ulps_count_the_numbers_between() -> None:
+def test_ulps_count_the_numbers_between():
     left = np.array([1.0, 0.0, -0.0, 5e-324, -1.0, 1.5])
     right = np.array([1.0 + 2.0**-51, -0.0, 5e-324, -5e-324, -1.0 - 2.0**-52, 1.5])
     assert ulps(left, right).tolist() == [2, 1, 2, 3, 1, 0]

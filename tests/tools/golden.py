@@ -1,80 +1,96 @@
-"""The golden digests: `python -m tests.tools.golden [--write] [--all]`.
+"""The golden digests: `python -m tests.tools.golden [--write]`.
 
-Without options: what differs from golden.json here. --write: make it anew, and say what changed.
---all: compare every setting of the matrix, and say which libraries each setting changes.
+Without --write: what differs from golden.json here. With it: make it anew, and say what changed.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 
-from tests.determinism.comparison import (
-    GOLDEN_FILE,
-    Golden,
-    condensed,
-    differences,
-    other_versions,
-    read_golden,
-    write_golden,
-)
-from tests.determinism.environments import ENVIRONMENTS, Environment
-from tests.determinism.stages import Stages
+import llvmlite
+import numba
+import numpy as np
+import torch
+
+from replay.comparing.differences import ulps
+from tests.determinism.record import ENVIRONMENTS, Golden, recorded
+
+GOLDEN_FILE = Path(__file__).parents[1] / "determinism" / "golden.json"
+
+
+def read_golden() -> Golden:
+    """The digests that every machine must give."""
+    return json.loads(GOLDEN_FILE.read_text())["cases"]
+
+
+def write_golden(golden: Golden) -> None:
+    """One line a stage, so that a change of one shows as one."""
+    cases = []
+    for case, stages in golden.items():
+        rows = [f"   {json.dumps(stage)}: {json.dumps(row)}" for stage, row in stages.items()]
+        cases.append(f"  {json.dumps(case)}: {{\n" + ",\n".join(rows) + "\n  }")
+    head = f'{{\n "versions": {json.dumps(versions())},\n "cases": {{\n'
+    GOLDEN_FILE.write_text(head + ",\n".join(cases) + "\n }\n}\n")
+
+
+def versions() -> dict[str, str]:
+    """Of the packages that could change a bit."""
+    return {module.__name__: module.__version__ for module in (np, torch, numba, llvmlite)}
+
+
+def other_versions() -> str:
+    """Which packages are not those with which golden.json was made; empty if all are."""
+    made, here = json.loads(GOLDEN_FILE.read_text())["versions"], versions()
+    other = (f"{name} {here[name]} for {made[name]}" for name in here if here[name] != made[name])
+    return ", ".join(other)
+
+
+def differences(golden: Golden, record: Golden, *, whole: bool = True) -> list[str]:
+    """A line for each case that is not as it should be, naming the first stage that differs.
+
+    whole: all stages must be there, as they are where an observer keeps them, and not the results
+    alone.
+    """
+    lines = [f"{case}: not recorded" for case in golden if case not in record]
+    lines += [f"{case}: not in golden.json" for case in record if case not in golden]
+    for case in golden.keys() & record.keys():
+        expected, stages = golden[case], record[case]
+        missing = [name for name in expected if whole or "hypotheses" in name]
+        found = [f"stage {name!r} is missing" for name in missing if name not in stages]
+        for name, row in stages.items():
+            if name not in expected:
+                found.insert(0, f"stage {name!r} is new")
+            elif row[0] != expected[name][0]:
+                found.insert(0, f"{name!r} differs, {_apart(expected[name][1:], row[1:])}")
+                break
+        lines += [f"{case}: {text}" for text in found[:1]]
+    return sorted(lines)
+
+
+def _apart(expected: list[str], found: list[str]) -> str:
+    """How far the samples of a stage are from those in golden.json."""
+    one, other = (np.array([float.fromhex(number) for number in row]) for row in (expected, found))
+    apart = int(ulps(one, other).max())
+    return f"by up to {apart} ulp in samples" if apart else "but not in samples"
 
 
 def main() -> None:
     """Compare or write; status 1 where something differs."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", action="store_true", help="write golden.json")
-    parser.add_argument("--all", action="store_true", help="every setting, not the default alone")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory:
-        record, libraries = ENVIRONMENTS["default"].record(Path(directory))
-        golden = read_golden() if GOLDEN_FILE.exists() else {}
-        lines = _changes(golden, record)
-        print("\n".join(lines) or f"all {len(record)} cases are as in {GOLDEN_FILE.name}")
-        if golden and other_versions():
-            print(f"{GOLDEN_FILE.name} was made with other packages: here {other_versions()}")
-        if arguments.write:
-            golden = condensed(record)
-            write_golden(golden)
-            print(f"{GOLDEN_FILE.name} written: {GOLDEN_FILE.stat().st_size} bytes")
-        unequal = bool(lines) and not arguments.write
-        if arguments.all:
-            unequal |= _matrix(ENVIRONMENTS, golden, record, libraries, Path(directory))
-    sys.exit(int(unequal))
-
-
-def _changes(golden: Golden, record: dict[str, Stages]) -> list[str]:
-    """What differs in the default setting, with stages that are gone."""
-    lines = differences(golden, record)
-    for case, stages in record.items():
-        gone = [stage for stage in golden.get(case, {}) if stage not in stages]
-        lines += [f"{case}: {len(gone)} stages are gone, first {gone[0]!r}"] if gone else []
-    return lines
-
-
-def _matrix(
-    matrix: Mapping[str, Environment],
-    golden: Golden,
-    usual: dict[str, Stages],
-    libraries: dict[str, str],
-    directory: Path,
-) -> bool:
-    """Print a line or more for each setting; whether any differs."""
-    unequal = False
-    for name, environment in matrix.items():
-        record, theirs = environment.record(directory)
-        lines = differences(golden, record, usual)
-        unequal |= bool(lines)
-        changed = [library for library in libraries if theirs[library] != libraries[library]]
-        verdict = f"{len(lines)} of {len(record)} cases differ" if lines else "equal"
-        print(f"{name}: {verdict} (libraries changed: {', '.join(changed) or 'none'})", flush=True)
-        print("".join(f"  {line}\n" for line in lines), end="")
-    return unequal
+        record, _ = recorded(ENVIRONMENTS["default"], Path(directory) / "record.json")
+    lines = differences(read_golden() if GOLDEN_FILE.exists() else {}, record)
+    print("\n".join(lines) or f"all {len(record)} cases are as in {GOLDEN_FILE.name}")
+    if arguments.write:
+        write_golden(record)
+    elif lines:
+        sys.exit(f"{GOLDEN_FILE.name} was made with other packages: here {other_versions()}")
 
 
 if __name__ == "__main__":

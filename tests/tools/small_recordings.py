@@ -1,31 +1,22 @@
 """Small recordings of real registrations, which fuzzing starts from."""
 
-from __future__ import annotations
-
 import dataclasses
-from collections.abc import Iterable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
 
 from chsel.methods import build_method, trust_by
-from chsel.methods.method import Method
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.policies import build_policy
 from chsel.policies.steering import Steering
-from chsel.problem.online_registration import OnlineRegistration, pose_problem
+from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import settings_mapping
-from chsel.problem.streams import StreamKey
 from replay.events import (
     ActionsOffered,
     Decided,
-    Event,
     HypothesesFound,
     Logged,
     Measured,
@@ -41,103 +32,70 @@ from replay.recorder import ListRecorder
 from replay.registration import register_recorded, symmetry_for_errors
 
 _SIDES = (0.1, 0.06, 0.04)
-_DESCENT = {"restarts": 2, "iterations": 4, "stop_below": None}
-_ONLINE = {"hypotheses": 4}
-_COST = {"penetration_tolerance": -0.005}
-STEERED = {
-    "probes": 3,
-    "stop": {"spread": 0.0, "gain": 0.0},
-    "belief": {"poses": 8},
-    "blocked": 1.0,
+STEERED = {"probes": 3, "stop": {"spread": 0.0, "gain": 0.0}, "belief": {"poses": 8}}
+STEERED["blocked"] = 1.0
+_DESCENT = {
+    "descent": {"restarts": 2, "iterations": 4, "stop_below": None},
+    "online": {"hypotheses": 4},
+    "cost": {"penetration_tolerance": -0.005},
 }
-METHODS: dict[str, dict[str, Any]] = {
-    "gradient_descent": {"descent": _DESCENT, "online": _ONLINE, "cost": _COST},
-    "chsel": {
-        "descent": _DESCENT,
-        "online": _ONLINE,
-        "cost": _COST,
-        "emitter": {"iterations": 12},
-        "archive": {"bins": 6},
-    },
-}
+_SEARCH = {"emitter": {"iterations": 12}, "archive": {"bins": 6}}
+METHODS = {"gradient_descent": _DESCENT, "chsel": _DESCENT | _SEARCH}
 
 
-def registered_session(name: str, *, seed: int = 3) -> list[Event]:
+def registered_session(name, *, seed=3):
     """The events of two steps of a box, each registered by a method of METHODS."""
-    method = build_method(name, METHODS[name])
-    random = np.random.default_rng(seed)
-    start = _start(random, name, method, seed)
-    recorder = ListRecorder()
-    recorder.record(start)
-    points = start.initial_points
-    previous: Hypotheses | None = None
-    for step in range(2):
-        probe = _probe(random, step)
-        recorder.record(probe)
-        points = points.merged(probe.new_points)
-        problem = pose_problem(
-            start.sdf,
-            points,
-            start.workspace,
-            start.free_resolution,
-            StreamKey(seed, step),
-            method.online,
-            previous,
-        )
-        posed = ProblemPosed(step, problem)
-        truth, symmetry = start.world_from_object, symmetry_for_errors(start)
-        registered = register_recorded(
-            posed, method, recorder, truth, symmetry, snapshot_interval=6
-        )
-        previous = registered.hypotheses
-        recorder.record(Logged(step, "info", f"probe {step}: contact"))
-    recorder.record(SessionEnded(1, "finished"))
-    return recorder.events
+    return _session(name, None, seed)
 
 
-def steered_session(
-    name: str = "gradient_descent", *, policy: str = "information", seed: int = 3, **changes: Any
-) -> list[Event]:
+def steered_session(name="gradient_descent", *, policy="information", seed=3, **changes):
     """The events of up to three probes of a box that a policy steers; changes: of its settings."""
+    return _session(name, policy, seed, changes)
+
+
+def _session(name, policy, seed, changes=None):
     method, random = build_method(name, METHODS[name]), np.random.default_rng(seed)
-    steers = build_policy(policy, STEERED | changes)
-    start = _start(random, name, method, seed)
-    group = {"name": policy, **settings_mapping(steers.settings)}
-    start = dataclasses.replace(start, config={**start.config, "policy": group})
-    offered = ActionsOffered(-1, _actions(), HandShape.of(trimesh.creation.box((0.05, 0.04, 0.03))))
+    start, recorder = _start(random, name, method, seed), ListRecorder()
     given = (start.sdf, start.workspace, start.free_resolution)
-    steering = Steering(steers, *given, offered.actions, offered.hand, seed=seed)
     online = OnlineRegistration(*given, method.online, seed=seed, points=start.initial_points)
-    recorder = ListRecorder()
+    found, steering = None, None
+    if policy is not None:
+        steers = build_policy(policy, STEERED | changes)
+        group = {"name": policy, **settings_mapping(steers.settings)}
+        start = dataclasses.replace(start, config={**start.config, "policy": group})
+        hand = HandShape.of(trimesh.creation.box((0.05, 0.04, 0.03)))
+        offered = ActionsOffered(-1, _actions(), hand)
+        steering = Steering(steers, *given, offered.actions, hand, seed=seed)
+        available = np.ones(len(offered.actions), dtype=bool)
     recorder.record(start)
-    recorder.record(offered)
-    available, found = np.ones(len(offered.actions), dtype=bool), None
-    for step in range(4):
-        choice = steering.decide(step, online.points, found, available)
-        recorder.record(Decided(step - 1, *choice, steering.surprise))
-        if choice.decision.stop:
-            break
-        available[choice.decision.chosen] = False
+    if steering is not None:
+        recorder.record(offered)
+    for step in range(2 if steering is None else 4):
+        if steering is not None:
+            choice = steering.decide(step, online.points, found, available)
+            recorder.record(Decided(step - 1, *choice, steering.surprise))
+            if choice.decision.stop:
+                break
+            available[choice.decision.chosen] = False
         probe = _probe(random, step)
         recorder.record(probe)
         online.points = online.points.merged(probe.new_points)
-        if steering.felt(probe.contacts):
+        if steering is not None and steering.felt(probe.contacts):
             online.start_afresh(steers.settings.surprise.larger)
-        truth, symmetry = start.world_from_object, symmetry_for_errors(start)
-        posed = ProblemPosed(step, online.pose(step))
+        posed, symmetry = ProblemPosed(step, online.pose(step)), symmetry_for_errors(start)
         found = register_recorded(
-            posed, method, recorder, truth, symmetry, snapshot_interval=6
+            posed, method, recorder, start.world_from_object, symmetry, snapshot_interval=6
         ).hypotheses
         online.remember(found)
         recorder.record(Logged(step, "info", f"probe {step}: contact"))
-    recorder.record(SessionEnded(step - 1, "finished"))
+        last = step
+    recorder.record(SessionEnded(last, "finished"))
     return recorder.events
 
 
-def robot_session(name: str) -> list[Event]:
+def robot_session(name):
     """The same events of a robot: a hand, and a depth and a deformation image before each probe."""
-    random = np.random.default_rng(5)
-    made: list[Event] = []
+    random, made = np.random.default_rng(5), []
     for event in registered_session(name):
         if isinstance(event, Probe):
             for sensor, kind in (("camera", "depth"), ("pad", "deformation")):
@@ -152,7 +110,7 @@ def robot_session(name: str) -> list[Event]:
     return made
 
 
-def write_recording(path: Path, events: Iterable[Event]) -> bytes:
+def write_recording(path, events):
     """The bytes of a new recording of events, at a path."""
     recorder = McapRecorder(path)
     try:
@@ -165,7 +123,7 @@ def write_recording(path: Path, events: Iterable[Event]) -> bytes:
     return path.read_bytes()
 
 
-def _start(random: np.random.Generator, name: str, method: Method, seed: int) -> SessionStarted:
+def _start(random, name, method, seed):
     """The start of a session with a box."""
     mesh = trimesh.creation.box(_SIDES)
     return SessionStarted(
@@ -185,7 +143,7 @@ def _start(random: np.random.Generator, name: str, method: Method, seed: int) ->
     )
 
 
-def _actions() -> Actions:
+def _actions():
     """Probes from two places each on four sides."""
     starts = np.tile(np.eye(4), (8, 1, 1))
     for index in range(8):
@@ -197,7 +155,7 @@ def _actions() -> Actions:
     return Actions(starts, np.full(8, 0.4))
 
 
-def _probe(random: np.random.Generator, step: int) -> Probe:
+def _probe(random, step):
     surface = random.uniform(-0.5, 0.5, (5, 3)) * _SIDES
     surface[:, step] = 0.5 * _SIDES[step]
     normals = np.zeros((5, 3))
@@ -211,15 +169,12 @@ def _probe(random: np.random.Generator, step: int) -> Probe:
     return Probe(step, "contact", new, np.eye(4)[None].repeat(2, axis=0), surface, normals)
 
 
-def measured_again(events: Iterable[Event], method: Method | None = None) -> list[Event]:
+def measured_again(events, method=None):
     """The events with the measured values that follow from their results by today's definition.
 
     method: that found them, for how far they are trusted; None: without.
     """
-    found: list[Event] = []
-    start: Any = None
-    problem: Any = None
-    hypotheses: Any = None
+    found = []
     for event in events:
         if isinstance(event, SessionStarted):
             start = event

@@ -1,12 +1,8 @@
 """Arguments with which each verb of `replay` runs on a recording."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 from replay.verbs import VERBS
 
-_ARGUMENTS: dict[str, tuple[str, ...]] = {
+_ARGUMENTS = {
     "accept": ("FILE", "--yes"),
     "compare": ("FILE", "--methods", "icp", "--steps", "STEP", "--save-csv", "OUT.csv"),
     "diff": ("FILE", "OTHER"),
@@ -20,9 +16,7 @@ _ARGUMENTS: dict[str, tuple[str, ...]] = {
 assert set(_ARGUMENTS) == set(VERBS)
 
 
-def verb_arguments(
-    verb: str, file: Path, out: Path, *, step: int = 8, other: Path | None = None
-) -> list[str]:
+def verb_arguments(verb, file, out, *, step=8, other=None):
     """The verb and its arguments. out: name of what is written, without its suffix."""
     names = {"FILE": str(file), "OTHER": str(other or file), "STEP": str(step)}
     words = (names.get(word, word) for word in _ARGUMENTS[verb])

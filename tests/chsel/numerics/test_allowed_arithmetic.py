@@ -1,14 +1,11 @@
 """Compiled code may use only operations whose result IEEE 754 fixes, in an order that we fix."""
 
-from __future__ import annotations
-
 import ast
 import re
-from pathlib import Path
 
 import pytest
 
-from tests.chsel.kernel_files import kernel_files
+from tests.chsel.samples import kernel_files
 
 SOURCES = kernel_files()
 ALLOWED_IN_MATH = {"sqrt", "floor", "ceil", "isfinite", "inf", "pi"}
@@ -19,168 +16,101 @@ FORBIDDEN_IN_NUMPY = re.compile(
     "|tensordot|einsum|linalg|(nan)?(sum|mean|std|var|prod)|average|trace|cumsum|random"
 )
 FORBIDDEN_METHODS = {"dot", "sum", "mean", "std", "var", "prod", "trace", "cumsum"}
-FUNCTION = "BITS = 20\nRATE = 0.5\n@compiled\ndef f(x, y):\n    "
-FORBIDDEN_OPTIONS = {"fastmath", "parallel"}
 COMPILED = {"compiled", "inner", "leaf", "spliced"}
 
 
-class Findings(ast.NodeVisitor):
-    """Collects what a source file calls that it must not, as "line: what"."""
+def findings(source, *, everywhere=True):
+    """What a file uses and must not, as "line: what"; everywhere: numpy outside of kernels, too."""
+    tree = ast.parse(source)
+    nodes = list(ast.walk(tree))
+    kernels = [node for node in nodes if isinstance(node, ast.FunctionDef) and _is_kernel(node)]
+    compiled = {node for kernel in kernels for node in ast.walk(kernel)}
+    modules, integers = {}, set()
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            modules |= {alias.asname or alias.name: alias.name for alias in node.names}
+    for line in tree.body:
+        if isinstance(line, ast.Assign) and _is_integer(line.value):
+            integers |= {name.id for name in line.targets if isinstance(name, ast.Name)}
 
-    def __init__(self, everywhere: bool) -> None:
-        self._everywhere = everywhere
-        self.found: list[str] = []
-        self._modules: dict[str, str] = {}
-        self._integers: set[str] = set()
-        self._compiled = False
+    def used(node):
+        """What of other modules, of operators and of options a node uses, as far as forbidden."""
+        match node:
+            case ast.ImportFrom(module=str(module)):
+                names = [f"{module}.{alias.name}" for alias in node.names]
+            case ast.Attribute(value=ast.Name(id=name)) if name in modules:
+                names = [f"{modules[name]}.{node.attr}"]
+            case ast.Call(func=ast.Attribute(value=value, attr=method)):
+                of_module = isinstance(value, ast.Name) and value.id in modules
+                is_summed = method in FORBIDDEN_METHODS and node in compiled and not of_module
+                return [f".{method}()"] if is_summed else []
+            case ast.Name(id="pow") | ast.Name(id="sum"):
+                return [node.id] if node.id == "pow" or node in compiled else []
+            case ast.BinOp(op=ast.MatMult()) | ast.AugAssign(op=ast.MatMult()):
+                return ["@"]
+            case ast.BinOp(op=ast.Pow(), right=power) | ast.AugAssign(op=ast.Pow(), value=power):
+                named = isinstance(power, ast.Name) and power.id in integers
+                return [] if named or _is_integer(power) else [f"** {ast.unparse(power)}"]
+            case ast.keyword(arg="fastmath" | "parallel", value=value):
+                return [] if isinstance(value, ast.Constant) and not value.value else [node.arg]
+            case _:
+                return []
+        return [name for name in names if _is_forbidden(name, everywhere or node in compiled)]
 
-    def visit_Module(self, node: ast.Module) -> None:
-        """Constants of the module that are integers stand for them."""
-        for line in node.body:
-            if isinstance(line, ast.Assign) and _is_integer(line.value):
-                self._integers |= {name.id for name in line.targets if isinstance(name, ast.Name)}
-        self.generic_visit(node)
-
-    def _add(self, node: ast.expr | ast.stmt, what: str) -> None:
-        self.found.append(f"{node.lineno}: {what}")
-
-    def _check(self, node: ast.expr | ast.stmt, module: str, name: str) -> None:
-        package, first = module.split(".")[0], [*module.split("."), name][1]
-        in_math = package == "math" and name not in ALLOWED_IN_MATH
-        in_numpy = package == "numpy" and FORBIDDEN_IN_NUMPY.fullmatch(first)
-        in_numpy = in_numpy and (self._compiled or self._everywhere)
-        if in_math or in_numpy or package == "cmath":
-            self._add(node, f"{module}.{name}")
-
-    def visit_Import(self, node: ast.Import) -> None:
-        for alias in node.names:
-            self._modules[alias.asname or alias.name.split(".")[0]] = (
-                alias.name if alias.asname else alias.name.split(".")[0]
-            )
-
-    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
-        for alias in node.names:
-            self._check(node, node.module or "", alias.name)
-
-    def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
-        names = [ast.unparse(decorator) for decorator in node.decorator_list]
-        outer, self._compiled = self._compiled, bool(COMPILED.intersection(names))
-        self.generic_visit(node)
-        self._compiled = outer
-
-    def visit_Attribute(self, node: ast.Attribute) -> None:
-        module = self._modules.get(node.value.id) if isinstance(node.value, ast.Name) else None
-        if module is not None:
-            self._check(node, module, node.attr)
-        self.generic_visit(node)
-
-    def visit_Call(self, node: ast.Call) -> None:
-        name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
-        of_module = isinstance(node.func, ast.Attribute) and isinstance(node.func.value, ast.Name)
-        of_module = of_module and node.func.value.id in self._modules
-        if self._compiled and name in FORBIDDEN_METHODS and not of_module:
-            self._add(node, f".{name}()")
-        self.generic_visit(node)
-
-    def visit_Name(self, node: ast.Name) -> None:
-        if node.id == "pow" or (self._compiled and node.id == "sum"):
-            self._add(node, node.id)
-
-    def visit_BinOp(self, node: ast.BinOp) -> None:
-        self._check_operator(node, node.op, node.right)
-
-    def visit_AugAssign(self, node: ast.AugAssign) -> None:
-        self._check_operator(node, node.op, node.value)
-
-    def _check_operator(
-        self, node: ast.BinOp | ast.AugAssign, operator: ast.operator, right: ast.expr
-    ) -> None:
-        if isinstance(operator, ast.MatMult):
-            self._add(node, "@")
-        named = isinstance(right, ast.Name) and right.id in self._integers
-        if isinstance(operator, ast.Pow) and not (named or _is_integer(right)):
-            self._add(node, f"** {ast.unparse(right)}")
-        self.generic_visit(node)
-
-    def visit_keyword(self, node: ast.keyword) -> None:
-        value = node.value
-        off = isinstance(value, ast.Constant) and not value.value
-        if node.arg in FORBIDDEN_OPTIONS and not off:
-            self._add(value, node.arg)
-        self.generic_visit(node)
+    return [f"{getattr(node, 'lineno', 0)}: {what}" for node in nodes for what in used(node)]
 
 
-def _is_integer(exponent: ast.expr) -> bool:
+def _is_kernel(function):
+    return not COMPILED.isdisjoint(map(ast.unparse, function.decorator_list))
+
+
+def _is_forbidden(name, in_kernel):
+    package, first, *_ = [*name.split("."), ""]
+    in_numpy = package == "numpy" and in_kernel and FORBIDDEN_IN_NUMPY.fullmatch(first)
+    return in_numpy or package == "cmath" or (package == "math" and first not in ALLOWED_IN_MATH)
+
+
+def _is_integer(exponent):
     if isinstance(exponent, ast.UnaryOp) and isinstance(exponent.op, ast.USub):
         exponent = exponent.operand
     return isinstance(exponent, ast.Constant) and type(exponent.value) is int
 
 
-def findings(source: str, *, everywhere: bool = True) -> list[str]:
-    """What a file uses; of numpy's functions, those inside of kernels alone if not everywhere."""
-    visitor = Findings(everywhere)
-    visitor.visit(ast.parse(source))
-    return visitor.found
-
-
 @pytest.mark.parametrize("path", SOURCES, ids=[path.name for path in SOURCES])
-def test_kernels_use_allowed_arithmetic_alone(path: Path) -> None:
+def test_kernels_use_allowed_arithmetic_alone(path):
     kernels_alone = path.parent.name == "numerics" or path.stem.endswith("_kernels")
     assert findings(path.read_text(), everywhere=kernels_alone) == []
 
 
-def test_beside_python_code_kernels_alone_are_searched() -> None:
+def test_beside_python_code_kernels_alone_are_searched():
     outside = "import numpy as np\ndef f(x):\n    return np.cumsum(x)\n"
     assert findings(outside) == ["3: numpy.cumsum"]
     assert findings(outside, everywhere=False) == []
-    inside = outside.replace("def", "@inner\ndef")
-    assert findings(inside, everywhere=False) == ["4: numpy.cumsum"]
+    assert findings(outside.replace("def", "@inner\ndef"), everywhere=False) == ["4: numpy.cumsum"]
+
+
+FUNCTION = "import math as m\nimport numpy as np\nBITS = 20\nRATE = 0.5\n@compiled\ndef f(x, y):\n"
 
 
 @pytest.mark.parametrize(
     "line",
     [
-        "return math.exp(x)",
-        "return math.hypot(x, x)",
-        "return m.log(x)",
-        "return np.exp(x)",
-        "return np.log(x)",
+        "return m.exp(x)",
         "return np.sin(x) + 1.0",
-        "return np.linalg.norm(x)",
-        "return np.dot(x, x)",
-        "return x.dot(x)",
         "return x.T.sum()",
         "return sum(x)",
         "return x @ x",
-        "return x**0.5",
-        "return x**y",
         "return x**RATE",
-        "return 2.0 ** (x + 1)",
-        "x **= y",
         "return pow(x, 2)",
-        "return np.power(x, 2)",
         "from math import cos",
-        "from numpy import linalg",
         "from numpy.linalg import norm",
         "return inner_compiled(x, fastmath=True)",
     ],
 )
-def test_what_is_not_allowed_is_found(line: str) -> None:
-    source = f"import math\nimport math as m\nimport numpy as np\n{FUNCTION}{line}\n"
-    assert len(findings(source)) == 1
+def test_what_is_not_allowed_is_found(line):
+    assert len(findings(f"{FUNCTION}    {line}\n")) == 1
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "return math.sqrt(x) + math.floor(y) + math.inf",
-        "return np.sqrt(x) + np.rint(x) + abs(x)",
-        "return x**2 + 2.0**-27 + 2.0**BITS",
-        "return strategy.mean[0]",
-        "return exp(x) + log(y)",
-        "return np.empty(3)",
-    ],
-)
-def test_what_is_allowed_is_not_found(line: str) -> None:
-    source = f"import math\nimport math as m\nimport numpy as np\n{FUNCTION}{line}\n"
-    assert findings(source) == []
+def test_what_is_allowed_is_not_found():
+    line = "return m.sqrt(x) + np.rint(x) + abs(x) + x**2 + 2.0**-27 + 2.0**BITS + exp(x) + s.mean"
+    assert findings(f"{FUNCTION}    {line}[0]\n") == []

@@ -1,21 +1,18 @@
-from __future__ import annotations
-
 import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chsel.numerics.arrays import FloatArray
 from chsel.numerics.eigen import decompose
 
 
 @numba.njit
-def decomposed(matrix, work, values, vectors):  # type: ignore[no-untyped-def]
+def decomposed(matrix, work, values, vectors):
     decompose(matrix, work, values, vectors)
 
 
-def eigen(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+def eigen(matrix):
     n = len(matrix)
     values, vectors = np.full(n, np.nan), np.full((n, n), np.nan)
     before = matrix.copy()
@@ -24,32 +21,29 @@ def eigen(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     return values, vectors
 
 
-def check(matrix: FloatArray, tolerance: float = 1e-14) -> None:
+def check(matrix):
     """Values as LAPACK has them, orthonormal vectors that give the matrix back."""
     values, vectors = eigen(matrix)
     size = float(np.abs(matrix).max()) or 1.0
     assert (np.diff(values) >= 0.0).all()
-    np.testing.assert_allclose(values, np.linalg.eigvalsh(matrix), rtol=0, atol=size * tolerance)
+    np.testing.assert_allclose(values, np.linalg.eigvalsh(matrix), rtol=0, atol=size * 1e-14)
     np.testing.assert_allclose(vectors.T @ vectors, np.eye(len(matrix)), rtol=0, atol=1e-14)
     back = (vectors * (values / size)) @ vectors.T
-    np.testing.assert_allclose(back, matrix / size, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(back, matrix / size, rtol=0, atol=1e-14)
     for column in vectors.T:
         assert column[np.abs(column).argmax()] > 0.0
 
 
-@settings(deadline=None, max_examples=200)
-@given(st.sampled_from([1, 2, 3, 4, 7, 9]), st.integers(0, 2**32 - 1), st.floats(-6.0, 6.0))
-def test_random_matrices(n: int, seed: int, exponent: float) -> None:
-    random = np.random.default_rng(seed).standard_normal((n, n))
-    check((random + random.T) * 10.0**exponent)
-
-
 @settings(deadline=None, max_examples=100)
-@given(st.sampled_from([2, 3, 4, 7, 9]), st.integers(0, 2**32 - 1), st.integers(1, 3))
-def test_repeated_eigenvalues(n: int, seed: int, different: int) -> None:
-    basis = np.linalg.qr(np.random.default_rng(seed).standard_normal((n, n)))[0]
-    matrix = (basis * np.resize(np.arange(different) + 1.0, n)) @ basis.T
-    check((matrix + matrix.T) / 2.0)
+@given(
+    st.sampled_from([1, 2, 3, 4, 9]), st.integers(0, 2**32 - 1), st.floats(-6, 6), st.integers(0, 3)
+)
+def test_random_matrices_some_of_repeated_eigenvalues(n, seed, exponent, different):
+    matrix = np.random.default_rng(seed).standard_normal((n, n))
+    if different:
+        basis = np.linalg.qr(matrix)[0]
+        matrix = (basis * np.resize(np.arange(different) + 1.0, n)) @ basis.T
+    check((matrix + matrix.T) * 10.0**exponent)
 
 
 @pytest.mark.parametrize(
@@ -57,20 +51,17 @@ def test_repeated_eigenvalues(n: int, seed: int, different: int) -> None:
     [
         np.zeros((3, 3)),
         np.eye(9),
-        np.diag([3.0, -1.0, 2.0]),
-        np.ones((4, 4)),
         np.array([[0.0, 1.0], [1.0, 0.0]]),
         np.array([[1.0, 1e-9, 0.0], [1e-9, 1.0, 1e-9], [0.0, 1e-9, 1.0]]),
         np.array([[1.0, 1e-20], [1e-20, 1e-40]]),
         1e-300 * np.array([[2.0, 1.0, 0.5], [1.0, 3.0, 0.2], [0.5, 0.2, 1.0]]),
-        1e150 * np.array([[2.0, 1.0], [1.0, 2.0]]),
     ],
 )
-def test_special_matrices(matrix: FloatArray) -> None:
+def test_special_matrices(matrix):
     check(matrix)
 
 
-def test_small_eigenvalues_of_a_positive_matrix_are_relatively_accurate() -> None:
+def test_small_eigenvalues_of_a_positive_matrix_are_relatively_accurate():
     scale = np.diag([1.0, 1e-6, 1e-12])
     correlation = np.array([[1.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 1.0]])
     values, _ = eigen(scale @ correlation @ scale)
@@ -79,12 +70,8 @@ def test_small_eigenvalues_of_a_positive_matrix_are_relatively_accurate() -> Non
     np.testing.assert_allclose(values, [last * 1e-24, 0.91e-12, 1.0], rtol=1e-11)
 
 
-def test_diagonal_matrices_are_sorted_with_unit_vectors() -> None:
+def test_diagonal_matrices_are_sorted_with_unit_vectors_and_nan_ends():
     values, vectors = eigen(np.diag([3.0, 1.0, 2.0]))
     np.testing.assert_array_equal(values, [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(vectors, np.eye(3)[:, [1, 2, 0]])
-
-
-def test_a_matrix_of_nan_ends() -> None:
-    values, _ = eigen(np.full((3, 3), np.nan))
-    assert np.isnan(values).all()
+    assert np.isnan(eigen(np.full((3, 3), np.nan))[0]).all()

@@ -1,74 +1,61 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 import trimesh
-from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation, Slerp
 
 from chsel import KnownPoints, SdfGrid
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.objective import Objective
-from chsel.errors import SettingError
+from chsel.errors import PoseError, SettingError
 from chsel.problem.poses import (
     Poses,
     apply,
     axis_angle,
+    check_rigid,
     compose,
+    interpolated,
     inverse,
+    nearest_rigid,
+    quaternions,
+    random_rotations,
+    rotation_matrices,
     rotation_vector,
 )
-from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
-from chsel.qd.measures import MEASURES, Measure, measure_named
+from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space
+from chsel.qd.measures import MEASURES, measure_named
 from tests.chsel.problem.torch_spaces import decode
 from tests.chsel.samples import random_poses
 
-BOX = SdfGrid.from_mesh(trimesh.creation.box((0.2, 0.1, 0.06)), 0.01)
+SIDES = (0.2, 0.1, 0.06)
+BOX = SdfGrid.from_mesh(trimesh.creation.box(SIDES), 0.01)
 STREAM = np.random.default_rng(0)
+TILTED = SE2Space(PlaneSettings(axis=(0.0, 0.6, 0.8), offset=0.1), BOX)
+OBLIQUE = SE2Space(
+    PlaneSettings(axis=(0.3, 0.6, 0.8), offset=0.1, resting_rotation=(0.4, 1.0, 0.2)), BOX
+)
 
 
-def random_transforms(count: int) -> np.ndarray:
-    return random_poses(STREAM, count, 0.3)
-
-
-def test_nine_numbers_and_transforms_are_inverse_to_each_other() -> None:
-    transforms = random_transforms(50)
+def test_nine_numbers_and_transforms_are_inverse_to_each_other():
+    transforms = random_poses(STREAM, 50, 0.3)
     vectors = SE3Space().encode(Poses.of(transforms))
     np.testing.assert_allclose(SE3Space().poses(vectors).matrices, transforms, atol=1e-14)
-
-
-def test_raw_rows_decode_to_the_rotation_of_gram_schmidt() -> None:
-    transforms = random_transforms(20)
-    vectors = SE3Space().encode(Poses.of(transforms))
     vectors[:, 3:6] = 1.7 * vectors[:, 3:6] - 0.4 * vectors[:, 0:3]  # same span, same halves
     vectors[:, 0:3] *= 0.2
     np.testing.assert_allclose(SE3Space().poses(vectors).matrices, transforms, atol=1e-12)
 
 
-def test_degenerate_rows_decode_to_finite_numbers() -> None:
-    vectors = torch.zeros((2, 9), dtype=torch.float64)
-    vectors[1, 0] = vectors[1, 3] = 1.0
-    rotation, _ = decode(SE3Space(), vectors)
-    assert bool(torch.isfinite(rotation).all())
+def test_plane_pose_of_a_tilted_rotation_is_the_nearest_by_frobenius():
+    tilt = axis_angle(np.array([0.8, 0.0, 0.6]), np.deg2rad(10.0))
+    angles = np.linspace(-np.pi, np.pi, 20_001)
+    turns = axis_angle(np.tile(TILTED.axis, (len(angles), 1)), angles)
+    for rotation in turns[::2222] @ tilt:
+        found = TILTED.encode(Poses.of(compose(rotation, np.zeros(3))[None]))[0, 0]
+        best = angles[((turns - rotation) ** 2).sum(axis=(1, 2)).argmin()]
+        assert np.cos(found - best) > np.cos(4e-4)
 
 
-def test_plane_pose_of_a_tilted_rotation_is_the_nearest_by_frobenius() -> None:
-    axis = np.array([0.0, 0.6, 0.8])
-    space = SE2Space(PlaneSettings(axis=tuple(axis), offset=-0.1), BOX)
-    for theta in np.linspace(-3.0, 3.0, 9):
-        tilt = axis_angle(np.array([0.8, 0.0, 0.6]), np.deg2rad(10.0))
-        rotation = axis_angle(axis, theta) @ tilt
-        found = space.encode(Poses.of(compose(rotation, np.zeros(3))[None]))[0, 0]
-
-        def distance(angle: float, rotation: np.ndarray = rotation) -> float:
-            return float(((axis_angle(axis, angle) - rotation) ** 2).sum())
-
-        best = minimize_scalar(distance, bracket=(theta - 0.3, theta, theta + 0.3), tol=1e-12).x
-        turns = (found - best) / (2 * np.pi)
-        assert abs(turns - round(turns)) * 2 * np.pi < 1e-6
-
-
-def test_plane_poses_survive_encoding_and_stay_on_the_plane() -> None:
+def test_plane_poses_survive_encoding_and_stay_on_the_plane():
     settings = PlaneSettings(axis=(0, 0, 2.0), offset=-0.1, resting_rotation=(np.pi / 2, 0, 0))
     space = SE2Space(settings, BOX)
     vectors = STREAM.uniform(-1.0, 1.0, (30, 3))
@@ -83,118 +70,133 @@ def test_plane_poses_survive_encoding_and_stay_on_the_plane() -> None:
     ("resting", "normal", "half"),
     [((0, 0, 0), (0, 0, 1), 0.03), ((np.pi / 2, 0, 0), (0, 1, 0), 0.05)],
 )
-def test_plane_height_puts_the_object_onto_the_plane(
-    resting: tuple[float, ...], normal: tuple[float, ...], half: float
-) -> None:
+def test_plane_height_puts_the_object_onto_the_plane(resting, normal, half):
     """A box at rest on a table at height 0.4, in every pose of the plane."""
-    world_axis = np.array([0.0, 0.0, 1.0])
-    axis = rotation_vector(np.array(resting)) @ world_axis
+    axis = rotation_vector(np.array(resting)) @ [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(np.abs(axis), normal, atol=1e-12)
     settings = PlaneSettings(axis=tuple(axis), plane_height=0.4, resting_rotation=resting)
     transforms = SE2Space(settings, BOX).poses(STREAM.uniform(-1.0, 1.0, (5, 3))).matrices
-    corners = trimesh.creation.box((0.2, 0.1, 0.06)).vertices
     for transform in transforms:
-        heights = apply(inverse(transform), corners)[:, 2]
+        heights = apply(inverse(transform), trimesh.creation.box(SIDES).vertices)[:, 2]
         assert heights.min() == pytest.approx(0.4, abs=1e-3)
         assert heights.max() == pytest.approx(0.4 + 2 * half, abs=1e-3)
-    np.testing.assert_allclose(np.abs(axis), normal, atol=1e-12)
 
 
-def objective_in(space: SearchSpace) -> Objective:
-    return Objective(CompiledCost(BOX, KnownPoints(known=[[0.0, 0.0, 0.0]])), space)
-
-
-@pytest.mark.parametrize("name", sorted(MEASURES))
-def test_measures_have_the_gradients_of_their_values(name: str) -> None:
-    planar = name.startswith("plane")
-    axis = (0.0, 0.6, 0.8)
-    space = SE2Space(PlaneSettings(axis=axis, offset=0.1), BOX) if planar else SE3Space()
-    assert_gradients_of_values(space, measure_named(name, planar=planar))
-
-
-@pytest.mark.parametrize("name", ["position_3", "object_xy", "object_yaw"])
-def test_measures_of_plane_poses_have_the_gradients_of_their_values(name: str) -> None:
-    space = SE2Space(PlaneSettings(axis=(0.0, 0.6, 0.8), offset=0.1), BOX)
-    assert_gradients_of_values(space, measure_named(name, planar=True))
-
-
-def assert_gradients_of_values(space: SearchSpace, measure: Measure) -> None:
-    """Central differences, at vectors that are not orthonormal."""
-    objective, step = objective_in(space), 1e-6
-    for vector in np.random.default_rng(1).uniform(-1.0, 1.0, (5, space.dimension)):
-        steps = step * np.eye(space.dimension)
-        ahead = measure.values(objective.space, vector + steps)
-        behind = measure.values(objective.space, vector - steps)
-        gradients = measure.gradients(objective.space, vector)
-        assert gradients.shape == (measure.count, space.dimension)
-        expected = (ahead - behind).T / (2.0 * step)
-        np.testing.assert_allclose(gradients, expected, rtol=1e-6, atol=1e-7)
-        assert (np.abs(gradients).max(axis=1) > 0.01).all()
-
-
-def test_measures_of_vectors_and_translations_are_their_entries() -> None:
-    vectors = STREAM.uniform(-1.0, 1.0, (10, 9))
-    objective = objective_in(SE3Space())
-    for count in range(1, 7):
-        found = MEASURES[f"rotation_{count}"].values(objective.space, vectors)
-        np.testing.assert_array_equal(found, vectors[:, :count])
-    for count in (2, 3):
-        found = MEASURES[f"position_{count}"].values(objective.space, vectors)
-        np.testing.assert_array_equal(found, vectors[:, 6 : 6 + count])
-    plane = SE2Space(PlaneSettings(axis=(0.0, 0.6, 0.8), offset=0.1), BOX)
-    poses = STREAM.uniform(-1.0, 1.0, (10, 3))
-    on_plane = objective_in(plane)
-    np.testing.assert_array_equal(
-        MEASURES["plane_position"].values(on_plane.space, poses), poses[:, 1:]
-    )
-    np.testing.assert_array_equal(
-        MEASURES["plane_angle"].values(on_plane.space, poses), poses[:, :1]
-    )
-    np.testing.assert_array_equal(
-        MEASURES["position_3"].values(on_plane.space, poses), plane.poses(poses).matrices[:, :3, 3]
-    )
-
-
-def test_object_measures_are_of_world_from_object() -> None:
-    transforms = random_transforms(10)
-    vectors = SE3Space().encode(Poses.of(transforms))
-    world, objective = inverse(transforms), objective_in(SE3Space())
-    xy = MEASURES["object_xy"].values(objective.space, vectors)
-    np.testing.assert_allclose(xy, world[:, :2, 3], atol=1e-14)
-    yaw = MEASURES["object_yaw"].values(objective.space, vectors)[:, 0]
-    np.testing.assert_allclose(yaw, np.arctan2(world[:, 1, 0], world[:, 0, 0]), atol=1e-12)
-
-
-def test_an_object_that_points_straight_up_has_a_yaw_and_no_gradient_of_it() -> None:
-    """The object's x axis along the world's z: the heading is not defined."""
-    rotation = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    vector = SE3Space().encode(Poses.of(compose(rotation[None], np.zeros((1, 3)))))
-    objective, yaw = objective_in(SE3Space()), MEASURES["object_yaw"]
-    assert np.isfinite(yaw.values(objective.space, vector)).all()
-    np.testing.assert_array_equal(yaw.gradients(objective.space, vector[0]), np.zeros((1, 9)))
-
-
-@pytest.mark.parametrize("planar", [False, True])
-def test_compiled_decoding_is_that_of_torch(planar: bool) -> None:
-    space: SearchSpace = SE3Space()
-    if planar:
-        settings = PlaneSettings(axis=(0.3, 0.6, 0.8), offset=0.1, resting_rotation=(0.4, 1.0, 0.2))
-        space = SE2Space(settings, BOX)
+@pytest.mark.parametrize("space", [SE3Space(), OBLIQUE])
+def test_compiled_decoding_is_that_of_torch(space):
     vectors = STREAM.uniform(-3.0, 3.0, (50, space.dimension))
     rotation, translation = decode(space, torch.tensor(vectors))
     expected = compose(rotation.numpy(), translation.numpy())
     np.testing.assert_allclose(space.poses(vectors).matrices, expected, rtol=0.0, atol=3e-15)
 
 
-def test_a_measure_of_the_other_space_names_those_that_fit() -> None:
+@pytest.mark.parametrize(
+    "changes", [{}, {"plane_height": 0.0, "offset": 0.0}, {"axis": (0, 0, 0), "offset": 0.0}]
+)
+def test_planes_that_say_too_little_or_too_much_are_refused(changes):
+    with pytest.raises(SettingError):
+        PlaneSettings(**changes)
+
+
+def measured(space):
+    """The space as measures take it."""
+    return Objective(CompiledCost(BOX, KnownPoints(known=[[0.0, 0.0, 0.0]])), space).space
+
+
+ON_PLANES = [name for name in MEASURES if name.startswith("plane")]
+CASES = [(name, TILTED if name in ON_PLANES else SE3Space()) for name in sorted(MEASURES)]
+CASES += [(name, TILTED) for name in ("position_3", "object_xy", "object_yaw")]
+
+
+@pytest.mark.parametrize(("name", "space"), CASES)
+def test_measures_have_the_gradients_of_their_values(name, space):
+    """Central differences, at vectors that are not orthonormal."""
+    measure = measure_named(name, planar=space is TILTED)
+    steps, given = 1e-6 * np.eye(space.dimension), measured(space)
+    for vector in np.random.default_rng(1).uniform(-1.0, 1.0, (5, space.dimension)):
+        rise = measure.values(given, vector + steps) - measure.values(given, vector - steps)
+        gradients = measure.gradients(given, vector)
+        assert gradients.shape == (measure.count, space.dimension)
+        np.testing.assert_allclose(gradients, rise.T / 2e-6, rtol=1e-6, atol=1e-7)
+        assert (np.abs(gradients).max(axis=1) > 0.01).all()
+
+
+def test_measures_of_vectors_and_translations_are_their_entries():
+    vectors, poses = STREAM.uniform(-1.0, 1.0, (10, 9)), STREAM.uniform(-1.0, 1.0, (10, 3))
+    expected = {f"rotation_{count}": vectors[:, :count] for count in range(1, 7)}
+    expected |= {f"position_{count}": vectors[:, 6 : 6 + count] for count in (2, 3)}
+    for name, values in expected.items():
+        np.testing.assert_array_equal(MEASURES[name].values(measured(SE3Space()), vectors), values)
+    expected = {"plane_position": poses[:, 1:], "plane_angle": poses[:, :1]}
+    expected["position_3"] = TILTED.poses(poses).matrices[:, :3, 3]
+    for name, values in expected.items():
+        np.testing.assert_array_equal(MEASURES[name].values(measured(TILTED), poses), values)
+
+
+def test_object_measures_are_of_world_from_object():
+    transforms = random_poses(STREAM, 10, 0.3)
+    world, vectors = inverse(transforms), SE3Space().encode(Poses.of(transforms))
+    xy, yaw = (
+        MEASURES[name].values(measured(SE3Space()), vectors) for name in ("object_xy", "object_yaw")
+    )
+    np.testing.assert_allclose(xy, world[:, :2, 3], atol=1e-14)
+    np.testing.assert_allclose(yaw[:, 0], np.arctan2(world[:, 1, 0], world[:, 0, 0]), atol=1e-12)
+
+
+def test_an_object_that_points_straight_up_has_a_yaw_and_no_gradient_of_it():
+    """The object's x axis along the world's z: the heading is not defined."""
+    rotation = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    vector = SE3Space().encode(Poses.of(compose(rotation[None], np.zeros((1, 3)))))
+    space, yaw = measured(SE3Space()), MEASURES["object_yaw"]
+    assert np.isfinite(yaw.values(space, vector)).all()
+    np.testing.assert_array_equal(yaw.gradients(space, vector[0]), np.zeros((1, 9)))
+
+
+def test_a_measure_of_the_other_space_names_those_that_fit():
     with pytest.raises(SettingError, match="only with plane; accepted: object_xy"):
         measure_named("plane_angle", planar=False)
     with pytest.raises(SettingError, match=r"only without plane; accepted: .*plane_position"):
         measure_named("rotation_3", planar=True)
 
 
-@pytest.mark.parametrize(
-    "changes", [{}, {"plane_height": 0.0, "offset": 0.0}, {"axis": (0, 0, 0), "offset": 0.0}]
-)
-def test_planes_that_say_too_little_or_too_much_are_refused(changes: dict[str, object]) -> None:
-    with pytest.raises(SettingError):
-        PlaneSettings(**changes)  # type: ignore[arg-type]
+def test_transforms_that_are_not_rigid_are_named():
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    check_rigid("poses", poses)
+    for row, column, value in ((0, 0, 1.1), (0, 0, -1.0), (3, 0, 0.5)):
+        broken = poses.copy()
+        broken[2, row, column] = value
+        with pytest.raises(PoseError, match=r"poses\[2\] is not a rigid transform"):
+            check_rigid("poses", broken)
+    rounded = np.round(poses + 1e-5 * np.arange(16).reshape(4, 4) * (np.arange(4)[:, None] < 3), 7)
+    check_rigid("poses", nearest_rigid("poses", rounded))
+
+
+def test_quaternions_and_rotations_are_each_others_inverse():
+    r = random_rotations(np.random.default_rng(0), 100)
+    r = np.concatenate([r, np.eye(3)[None], axis_angle(np.eye(3), np.full(3, np.pi))])
+    np.testing.assert_allclose(rotation_matrices(quaternions(r)), r, atol=1e-14)
+
+
+def test_turns_are_those_of_scipy_and_positions_on_a_line():
+    first, second = random_rotations(np.random.default_rng(1), 2)
+    t = np.array([0.0, 0.1, 0.5, 0.9, 1.0])
+    ends = np.tile(compose(first, np.array([1.0, 2.0, 3.0])), (5, 1, 1))
+    others = np.tile(compose(second, np.array([2.0, 0.0, 3.0])), (5, 1, 1))
+    between = interpolated(ends, others, t)
+    expected = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([first, second])))(t)
+    np.testing.assert_allclose(between[:, :3, :3], expected.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(between[:, :3, 3], [[1 + s, 2 - 2 * s, 3] for s in t], atol=1e-15)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, np.pi])
+def test_half_of_a_turn_is_half_its_angle(angle):
+    rotation = random_rotations(np.random.default_rng(2), 1)[0]
+    axis = np.array([0.6, 0.0, 0.8])
+    start, half, turned = (
+        compose(axis_angle(axis, part * angle) @ rotation, np.zeros(3))[None]
+        for part in (0.0, 0.5, 1.0)
+    )
+    found = interpolated(start, turned, np.array([0.5]))
+    if angle == np.pi:  # either way round is as short
+        found, half = interpolated(found, turned, np.array([1.0])), turned
+    np.testing.assert_allclose(found, half, atol=1e-12)

@@ -1,12 +1,8 @@
 """Settings from mappings and back, and choices of installed packages by their entry points."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import pytest
 
@@ -29,11 +25,11 @@ from chsel.problem.settings import (
 )
 
 
-@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("method", METHODS)
-def test_every_preset_survives_the_way_through_a_mapping(method: str, preset: str) -> None:
-    settings = preset_settings(method, preset)
-    assert build_method(method, settings_mapping(settings)).settings == settings
+def test_every_preset_survives_the_way_through_a_mapping(method):
+    for preset in PRESETS:
+        settings = preset_settings(method, preset)
+        assert build_method(method, settings_mapping(settings)).settings == settings
 
 
 @pytest.mark.parametrize(
@@ -41,17 +37,12 @@ def test_every_preset_survives_the_way_through_a_mapping(method: str, preset: st
     [
         ({"cots": {}}, r"method.cots does not exist; did you mean cost\? accepted: archive, cost"),
         ({"cost": {"free_scale": "x"}}, r"method.cost.free_scale is 'x'; accepted: a number"),
-        ({"passes": 1.5}, r"method.passes is 1.5; accepted: an integer"),
-        ({"passes": True}, r"method.passes is True; accepted: an integer"),
-        ({"cost": 3}, r"method.cost is 3; accepted: a group"),
         ({"cost": {"lookup": None}}, r"method.cost.lookup is None; accepted: a text"),
         ({"plane": {"axis": [0, 1], "offset": 0}}, r"method.plane.axis has 2 entries; accepted: 3"),
         ({"archive": {"bins": 0}}, r"method.archive: bins is 0"),
     ],
 )
-def test_wrong_settings_name_the_key_and_what_is_accepted(
-    mapping: dict[str, object], message: str
-) -> None:
+def test_wrong_settings_name_the_key_and_what_is_accepted(mapping, message):
     with pytest.raises(SettingError, match=message):
         build_settings(ChselSettings, mapping, "method")
 
@@ -67,7 +58,7 @@ class Checked(CheckedSettings):
     limit: Annotated[float | None, positive, at_most(5.0)] = None
     free: float = -1.0
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         super().__post_init__()
         if self.limit is not None and self.rate > self.limit:
             raise SettingError(f"rate is {self.rate}; accepted: at most limit")
@@ -76,37 +67,26 @@ class Checked(CheckedSettings):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"rate": 0.0}, "rate is 0.0; accepted: a finite number above 0"),
         ({"rate": float("nan")}, "rate is nan; accepted: a finite number above 0"),
-        ({"rate": "x"}, "rate is 'x'; accepted: a finite number above 0"),
-        ({"rate": None}, "rate is None; accepted: a finite number above 0"),
         ({"count": -1}, "count is -1; accepted: a finite number of at least 0"),
         ({"count": 1_001}, "count is 1001; accepted: at most 1_000"),
         ({"length": 20.0}, r"length is 20.0; accepted: 0.001 to 10 (m)"),
-        ({"length": float("nan")}, r"length is nan; accepted: 0.001 to 10 (m)"),
-        ({"name": "c"}, "name is 'c'; accepted: a, b"),
-        ({"name": None}, "name is None; accepted: a, b"),
-        ({"limit": -1.0}, "limit is -1.0; accepted: a finite number above 0"),
         ({"limit": 6.0}, "limit is 6.0; accepted: at most 5.0"),
         ({"limit": 0.5}, "rate is 1.0; accepted: at most limit"),
         ({"limit": 0.5, "name": "c"}, "name is 'c'; accepted: a, b"),
     ],
 )
-def test_settings_accept_what_their_annotations_and_their_class_accept(
-    values: dict[str, Any], message: str
-) -> None:
+def test_settings_accept_what_their_annotations_and_their_class_accept(values, message):
     with pytest.raises(SettingError, match=f"^{re.escape(message)}$"):
         Checked(**values)
 
 
-def test_values_at_the_limits_and_none_pass_where_the_type_has_it() -> None:
+def test_values_at_the_limits_and_none_pass_where_the_type_has_it():
     limits = Checked(count=1_000, length=10.0, limit=5.0)
     assert build_settings(Checked, settings_mapping(limits), "settings") == limits
     assert build_settings(Checked, {"limit": None, "rate": 2}, "settings") == Checked(rate=2.0)
     with pytest.raises(SettingError, match=r"^settings.count is None; accepted: an integer$"):
         build_settings(Checked, {"count": None}, "settings")
-    with pytest.raises(SettingError, match=r"^settings: limit is 0.0; accepted: a finite number"):
-        build_settings(Checked, {"limit": 0}, "settings")
 
 
 POLICY = """
@@ -124,31 +104,27 @@ class Plain:
     settings = MineSettings()
 
 class Unlike:
-    settings = {settings}
-    def decide(self, problem):
-        return None
+    settings = {}
 
 class Unready:
     def __init__(self):
         raise RuntimeError("no\\nlicence")
 """
-Install = Callable[..., NamedChoices]
 
 
 @pytest.fixture
-def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
+def install(tmp_path, monkeypatch):
     """Installs packages that each offer a policy, as pip does; the choices that there are then."""
 
-    def done(*lines: str, settings: str = "{}") -> NamedChoices:
+    def done(*lines):
         module = f"offered_by_{tmp_path.name}"  # imported once in a process
         for number, line in enumerate(lines):
             about = tmp_path / f"mine{number}-1.dist-info"
             about.mkdir()
             (about / "METADATA").write_text(f"Name: mine{number}\nVersion: 1\n")
-            (about / "entry_points.txt").write_text(
-                f"[chsel.policies]\n{line.replace('mine:', module + ':')}\n"
-            )
-        (tmp_path / f"{module}.py").write_text(POLICY.replace("{settings}", settings))
+            entry = line.replace("mine:", f"{module}:")
+            (about / "entry_points.txt").write_text(f"[chsel.policies]\n{entry}\n")
+        (tmp_path / f"{module}.py").write_text(POLICY)
         monkeypatch.syspath_prepend(str(tmp_path))
         ours = {"grid": (ConfiguredPolicy, PolicySettings())}
         return NamedChoices("policy", "chsel.policies", "docs/page.md", ours, _lacks)
@@ -156,7 +132,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
     return done
 
 
-def test_a_choice_of_a_package_is_built_as_ours_are(install: Install) -> None:
+def test_a_choice_of_a_package_is_built_as_ours_are(install):
     choices = install("mine = mine:Mine")
     assert choices.names == ("grid", "mine")
     make, default = choices.entry("mine")
@@ -167,21 +143,17 @@ def test_a_choice_of_a_package_is_built_as_ours_are(install: Install) -> None:
 
 
 @pytest.mark.parametrize(
-    ("lines", "settings", "message"),
+    ("lines", "message"),
     [
-        (["mine = mine:Nothing"], "{}", "policy mine of package mine0 cannot be loaded: Attribute"),
-        (["mine = mine:Unready"], "{}", "cannot be loaded: RuntimeError: no licence; accepted: a"),
-        (["mine = nowhere:Mine"], "{}", "cannot be loaded: ModuleNotFoundError"),
-        (["mine = mine:Unlike"], "{}", "has settings {}; accepted: a frozen dataclass"),
-        (["mine = mine:Unlike"], "__import__('chsel').CostSettings()", "one derived from Policy"),
-        (["mine = mine:Plain"], "{}", "has no `decide`; accepted: decide(problem); see docs/page"),
-        (["mine = mine:Mine"] * 2, "{}", "policy mine is of mine0 and mine1; accepted: one of"),
+        (["mine = mine:Unready"], "cannot be loaded: RuntimeError: no licence; accepted: a"),
+        (["mine = nowhere:Mine"], "policy mine of package mine0 cannot be loaded: ModuleNotFound"),
+        (["mine = mine:Unlike"], "has settings {}; accepted: a frozen dataclass"),
+        (["mine = mine:Plain"], "has no `decide`; accepted: decide(problem); see docs/page"),
+        (["mine = mine:Mine"] * 2, "policy mine is of mine0 and mine1; accepted: one of"),
     ],
 )
-def test_what_cannot_be_taken_is_one_line(
-    install: Install, lines: list[str], settings: str, message: str
-) -> None:
-    choices = install(*lines, settings=settings)
+def test_what_cannot_be_taken_is_one_line(install, lines, message):
+    choices = install(*lines)
     with pytest.raises(SettingError) as caught:
         choices.entry("mine")
     assert message in str(caught.value)
@@ -189,7 +161,7 @@ def test_what_cannot_be_taken_is_one_line(
     assert choices.build("grid")  # others go on as ever
 
 
-def test_a_name_of_ours_is_not_taken_from_us(install: Install) -> None:
+def test_a_name_of_ours_is_not_taken_from_us(install):
     choices = install("grid = mine:Mine")
     assert choices.names == ("grid",)
     with pytest.raises(SettingError, match="policy grid is of package mine0, too; accepted: one"):

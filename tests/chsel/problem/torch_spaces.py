@@ -1,37 +1,30 @@
 """The decoding of search vectors in torch: the reference for that of the kernels."""
 
-from __future__ import annotations
-
 import torch
-from torch import Tensor
 
 from chsel.problem.poses import hat
-from chsel.problem.search_space import SE2Space, SearchSpace
+from chsel.problem.search_space import SE2Space
 
 
-def decode(space: SearchSpace, vectors: Tensor) -> tuple[Tensor, Tensor]:
+def decode(space, vectors):
     """Rotations (B, 3, 3) and translations (B, 3) of vectors (B, d), differentiable."""
     if not isinstance(space, SE2Space):
         return _gram_schmidt(vectors[:, :6]), vectors[:, 6:9]
     turn, rest = torch.tensor(hat(space.axis)), torch.tensor(space.resting_rotation)
     e_u, e_v, axis = (torch.tensor(part).double() for part in (space.e_u, space.e_v, space.axis))
     identity = torch.eye(3, dtype=torch.float64)
-    turn_squared = axis[:, None] * axis - identity
-    sine, cosine = torch.sin(vectors[:, 0]), torch.cos(vectors[:, 0])
-    about_axis = identity + sine[:, None, None] * turn
-    about_axis = about_axis + (1.0 - cosine)[:, None, None] * turn_squared
-    rotation = (about_axis[:, :, :, None] * rest[None, None]).sum(dim=2)
-    return rotation, vectors[:, 1:2] * e_u + vectors[:, 2:3] * e_v + space.offset * axis
+    sine, cosine = (f(vectors[:, 0])[:, None, None] for f in (torch.sin, torch.cos))
+    about_axis = identity + sine * turn + (1.0 - cosine) * (axis[:, None] * axis - identity)
+    return about_axis @ rest, vectors[:, 1:2] * e_u + vectors[:, 2:3] * e_v + space.offset * axis
 
 
-def _gram_schmidt(rows: Tensor) -> Tensor:
+def _gram_schmidt(rows):
     """Rotations (B, 3, 3) of raw 6-D vectors (B, 6) by Gram-Schmidt on two rows (Zhou et al.)."""
-    first, second = rows[:, 0:3], rows[:, 3:6]
-    b1 = _unit(first)
-    b2 = second - (b1 * second).cumsum(dim=1)[:, 2:] * b1
-    b2 = _unit(b2)
+    b1 = _unit(rows[:, 0:3])
+    second = rows[:, 3:6]
+    b2 = _unit(second - (b1 * second).sum(dim=1, keepdim=True) * b1)
     return torch.stack([b1, b2, torch.linalg.cross(b1, b2)], dim=1)
 
 
-def _unit(vectors: Tensor) -> Tensor:
+def _unit(vectors):
     return vectors / vectors.norm(dim=1, keepdim=True).clamp_min(1e-12)

@@ -1,18 +1,15 @@
 """Cameras, reliable pixels, and regions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from chsel.errors import PointsError, SettingError
+from chsel.errors import SettingError
 from chsel.sensing.depth_camera import (
     PinholeCamera,
     depth_regions,
     main_regions,
     occlusion_edges,
     point_regions,
-    small_regions,
     speckle_free,
     valid_pixels,
 )
@@ -20,13 +17,12 @@ from chsel.sensing.depth_camera import (
 CAMERA = PinholeCamera(4, 3, 2.0, 4.0, 1.0, 1.5)
 
 
-def test_points_project_back_onto_their_pixels() -> None:
+def test_points_project_back_onto_their_pixels():
     depth = np.array([[1.0, 2.0, 3.0, 4.0], [0.5, 0.5, 0.5, 0.5], [1.0, 1.0, 1.0, 8.0]])
     points = CAMERA.back_project(depth)
     np.testing.assert_array_equal(points[2, 3], [8.0, 1.0, 8.0])
     u, v = 2.0 * points[..., 0] / points[..., 2] + 1.0, 4.0 * points[..., 1] / points[..., 2] + 1.5
-    np.testing.assert_allclose(u, np.tile([0.0, 1.0, 2.0, 3.0], (3, 1)), atol=1e-12)
-    np.testing.assert_allclose(v, np.tile([[0.0], [1.0], [2.0]], (1, 4)), atol=1e-12)
+    np.testing.assert_allclose([v, u], np.indices((3, 4)), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -34,30 +30,22 @@ def test_points_project_back_onto_their_pixels() -> None:
     [
         ((0, 3, 1.0, 1.0, 0.0, 0.0), "camera width is 0; accepted"),
         ((4, 3.5, 1.0, 1.0, 0.0, 0.0), "camera height is 3.5; accepted: a whole number"),
-        ((4, 10**9, 1.0, 1.0, 0.0, 0.0), "camera height is 1000000000; accepted: .* to 100_000"),
-        ((4, 3, 0.0, 1.0, 0.0, 0.0), "camera fx is 0.0; accepted"),
-        ((4, 3, 1.0, float("nan"), 0.0, 0.0), "camera fy is nan; accepted"),
         ((4, 3, 1.0, 1.0, float("inf"), 0.0), "camera cx, cy are inf, 0.0; accepted: finite"),
     ],
 )
-def test_what_no_camera_has_is_refused(values: tuple[float, ...], message: str) -> None:
+def test_what_no_camera_has_is_refused(values, message):
     with pytest.raises(SettingError, match=message):
-        PinholeCamera(*values)  # type: ignore[arg-type]
+        PinholeCamera(*values)
 
 
-def test_an_image_of_another_size_is_refused() -> None:
-    with pytest.raises(PointsError, match=r"depth has shape \(4, 3\); accepted: \(3, 4\)"):
-        CAMERA.back_project(np.ones((4, 3)))
-
-
-def test_only_depths_within_the_range_are_valid() -> None:
+def test_only_depths_within_the_range_are_valid():
     depth = np.array([0.0, -1.0, np.nan, np.inf, -np.inf, 0.19, 0.2, 1.0, 5.0, 5.1])
     valid = valid_pixels(depth, nearest=0.2, furthest=5.0)
     assert valid.tolist() == [False] * 6 + [True] * 3 + [False]
     assert not valid_pixels(np.array([0.0, np.inf]), nearest=0.0, furthest=np.inf).any()
 
 
-def test_edges_are_both_sides_of_every_jump_between_valid_neighbours() -> None:
+def test_edges_are_both_sides_of_every_jump_between_valid_neighbours():
     stream = np.random.default_rng(0)
     depth = np.where(stream.random((12, 15)) < 0.1, 1.0, 0.5) + stream.uniform(0.0, 0.02, (12, 15))
     depth[stream.random(depth.shape) < 0.2] = np.nan
@@ -71,12 +59,7 @@ def test_edges_are_both_sides_of_every_jump_between_valid_neighbours() -> None:
         assert edges[row, column] == expected
 
 
-def test_a_slope_is_no_edge() -> None:
-    depth = np.tile(np.linspace(0.5, 1.5, 50), (20, 1))
-    assert not occlusion_edges(depth, np.ones(depth.shape, bool), 0.05).any()
-
-
-def test_a_longer_reach_looks_across_a_gap() -> None:
+def test_a_longer_reach_looks_across_a_gap():
     depth = np.full((5, 9), 0.5)
     depth[:, 5:] = 1.0
     valid = np.ones(depth.shape, dtype=bool)
@@ -89,11 +72,11 @@ def test_a_longer_reach_looks_across_a_gap() -> None:
 TELE = PinholeCamera(60, 40, 600.0, 600.0, 29.5, 19.5)
 
 
-def regions(depth: np.ndarray, jump: float = 0.01, camera: PinholeCamera = TELE) -> np.ndarray:
+def regions(depth, jump=0.01, camera=TELE):
     return depth_regions(depth, depth > 0.0, camera, jump)
 
 
-def test_regions_end_where_depth_jumps_and_the_threshold_grows_with_depth() -> None:
+def test_regions_end_where_depth_jumps_and_the_threshold_grows_with_depth():
     depth = np.full((40, 60), 0.6)
     depth[:, 30:] += 0.015  # 2.5 % at 0.6 m; 1 % and the slant explain 1.67 %
     found = regions(depth)
@@ -106,14 +89,14 @@ def test_regions_end_where_depth_jumps_and_the_threshold_grows_with_depth() -> N
     assert regions(depth, jump=0.005, camera=PinholeCamera(60, 40, 300, 300, 29.5, 19.5)).max() == 1
 
 
-def test_a_steeply_inclined_surface_is_one_region() -> None:
+def test_a_steeply_inclined_surface_is_one_region():
     slope = np.tan(np.radians(75.0))
     depth = 0.6 / (1.0 - slope * TELE.columns)[None].repeat(40, axis=0)
     assert np.abs(np.diff(depth, axis=1)).max() > 0.0035
     assert regions(depth, jump=0.001).max() == 1
 
 
-def test_pixels_that_do_not_count_are_in_no_region_and_connect_none() -> None:
+def test_pixels_that_do_not_count_are_in_no_region_and_connect_none():
     depth = np.full((40, 60), 0.6)
     depth[20], depth[5, 5] = 0.0, np.nan
     found = depth_regions(depth, np.isfinite(depth) & (depth > 0.0), TELE, 0.01)
@@ -126,34 +109,26 @@ def test_pixels_that_do_not_count_are_in_no_region_and_connect_none() -> None:
     assert regions(diagonal, camera=PinholeCamera(3, 3, 9.0, 9.0, 1.0, 1.0)).max() == 3
 
 
-def test_small_regions_are_those_of_fewer_pixels() -> None:
-    depth = np.full((40, 60), 0.6)
-    depth[10:13, 10:13] = 0.9
-    for least, count in ((9, 0), (10, 9), (0, 0), (10**6, 40 * 60)):
-        assert int(small_regions(regions(depth), least).sum()) == count
-
-
-@pytest.mark.parametrize("side", [1, 5, 9])
-def test_rays_of_small_regions_end_at_the_least_depth_around(side: int) -> None:
+@pytest.mark.parametrize("side", [1, 9])
+def test_rays_of_small_regions_end_at_the_least_depth_around(side):
     depth = np.full((40, 60), 0.6)
     depth[10 : 10 + side, 20 : 20 + side] = 0.9
     ends, small = speckle_free(depth, depth > 0.0, regions(depth), 100)
     assert small == side**2
     np.testing.assert_array_equal(ends, np.full((40, 60), 0.6))
-    nearer = depth.copy()
-    nearer[30, 30] = 0.4  # ends at itself
-    ends, small = speckle_free(nearer, depth > 0.0, regions(nearer), 100)
+    depth[30, 30] = 0.4  # ends at itself
+    ends, small = speckle_free(depth, depth > 0.0, regions(depth), 100)
     assert (small, ends[30, 30], ends[30, 31]) == (side**2 + 1, 0.4, 0.6)
     assert speckle_free(depth, depth > 0.0, regions(depth), 0)[1] == 0
 
 
-def surface(count: int, size: float, centre: tuple[float, float, float]) -> np.ndarray:
+def surface(count, size, centre):
     """Random points on a square (count, 3)."""
     plane = np.random.default_rng(count).uniform(-0.5, 0.5, (count, 2)) * size
     return np.pad(plane, ((0, 0), (0, 1))) + centre
 
 
-def test_points_are_one_region_up_to_the_gap_and_others_beyond() -> None:
+def test_points_are_one_region_up_to_the_gap_and_others_beyond():
     one, other = surface(2000, 0.1, (0, 0, 0)), surface(300, 0.03, (0.2, 0, 0))
     found = point_regions(np.concatenate([one, other]), 0.02)
     assert (np.unique(found[:2000]).tolist(), np.unique(found[2000:]).tolist()) == ([1], [2])
@@ -161,7 +136,7 @@ def test_points_are_one_region_up_to_the_gap_and_others_beyond() -> None:
     assert point_regions(np.concatenate([one, near]), 0.02).max() == 1
 
 
-def test_sparse_points_are_one_region_whatever_the_gap() -> None:
+def test_sparse_points_are_one_region_whatever_the_gap():
     sparse = surface(400, 1.0, (0, 0, 0))  # about 25 mm apart
     assert np.bincount(point_regions(sparse, 0.001))[1:].max() > 390
     touches = np.array([[0.0, 0, 0], [0.05, 0, 0], [0, 0.05, 0]])
@@ -182,8 +157,8 @@ def test_sparse_points_are_one_region_whatever_the_gap() -> None:
     ],
 )
 def test_the_largest_region_is_kept_and_large_ones_within_the_objects_diameter(
-    sizes: list[int], centres: list[float], kept: list[bool], small: int, far: int
-) -> None:
+    sizes, centres, kept, small, far
+):
     regions = np.repeat(np.arange(len(sizes)) + 1, sizes)
     points = np.zeros((len(regions), 3))
     points[:, 2] = np.repeat(centres, sizes)

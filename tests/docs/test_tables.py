@@ -1,0 +1,174 @@
+"""What pages say is so: settings, presets, names of files and classes, times."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+
+from chsel.methods import OURS, preset_settings
+from chsel.next_probe.decision_problem import STOPS, Actions
+from chsel.next_probe.forecast import surprise
+from chsel.plausible.plausible_settings import plausible_settings
+from chsel.policies import OURS as POLICIES
+from chsel.policies.policy import PolicySettings
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import compose
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import in_preset, settings_mapping
+from runners.sessions.probing_settings import ProbingSettings
+from tests.chsel.samples import REPOSITORY
+
+DOCS = REPOSITORY / "docs"
+NEXT_PROBE, PRESETS = ((DOCS / name).read_text() for name in ("next_probe.md", "presets.md"))
+
+
+def test_files_and_classes_that_the_page_of_the_architecture_names_exist():
+    page = re.sub(r"^```.*?^```$", "", (DOCS / "architecture.md").read_text(), flags=re.M | re.S)
+    words = set(re.findall(r"`([\w./-]+)`", page))
+    folders = ("chsel", "conf", "replay", "runners", "tests")
+    files = [file for folder in folders for file in (REPOSITORY / folder).rglob("*.*")]
+    paths = "\n".join(f"/{file.relative_to(REPOSITORY).as_posix()}\n" for file in files)
+    named = {word for word in words if word.endswith((".py", ".yaml", ".json"))}
+    assert len(named) > 30
+    assert {word for word in named if f"/{word}\n" not in paths} == set()
+    text = "".join(file.read_text() for file in files if file.suffix == ".py")
+    classes = {word for word in words if re.fullmatch(r"(?:[A-Z][a-z0-9]+){2,}", word)}
+    assert len(classes) > 8
+    assert {word for word in classes if not re.search(rf"\b{word}\b", text)} == set()
+
+
+def cells(title):
+    """The rows of the tables of a section of next_probe.md, by their first cell, a name."""
+    section = re.split(rf"^## {title}\n", NEXT_PROBE, flags=re.MULTILINE)[1].partition("\n## ")[0]
+    rows = re.findall(r"^\| `([\w.]+)` \| (.+) \|$", section, re.MULTILINE)
+    return {name: text.split(" | ") for name, text in rows}
+
+
+def flat(settings, path=""):
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{path}{name}.")
+        else:
+            yield path + name, value
+
+
+def test_every_policy_setting_and_reason_to_stop_is_there():
+    assert set(cells("Policies")) == set(POLICIES)
+    assert set(cells("When to stop")) == set(STOPS) - {""}
+    shown = {name: yaml.safe_load(row[0]) for name, row in cells("Settings").items()}
+    settings = dict(flat(settings_mapping(PolicySettings())))
+    assert shown == {name: settings[name] for name in shown}
+    assert set(settings) - set(shown) == {"actions.reach"}  # a group of its own, named above
+
+
+def test_the_program_of_the_next_probe_runs():
+    mesh = trimesh.creation.box(extents=(0.1, 0.1, 0.2))
+    starts = np.array([[x, 0.0, -0.4] for x in (-0.1, 0.0, 0.1)])
+    (program,) = re.findall(r"```python\n(.*?)```", NEXT_PROBE, re.DOTALL)
+    names = {
+        "grid": SdfGrid.from_mesh(mesh, 0.01),
+        "workspace": Workspace((-0.2,) * 3, (0.2,) * 3),
+        "actions": Actions(compose(np.tile(np.eye(3), (3, 1, 1)), starts), np.full(3, 0.6)),
+        "vertices": 0.3 * mesh.vertices,
+        "faces": mesh.faces,
+        "done": 0,
+        "points": KnownPoints(),
+        "hypotheses": None,
+        "available": np.array([True, True, False]),
+        "contacts": np.array([[0.0, 0.0, -0.1]]),
+    }
+    exec(program, names)
+    decision = names["decision"]
+    assert decision.chosen == int(np.argmax(decision.score)) in (0, 1)
+    assert decision.score[2] == -np.inf
+    felt = surprise(names["problem"], decision, PolicySettings().noise, names["contacts"][0])
+    assert names["steering"].surprise == felt
+
+
+ORDER = ("paper", "reference", "default")
+PRINTED = re.compile(r"^\| [^|]+ \| `(?P<setting>[\w.]+)` \| (?P<value>[-\d.]+) \|$", re.MULTILINE)
+
+
+def settings_of(name, preset):
+    """The settings of a method, a session or a definition in a preset."""
+    if name == "session":
+        return in_preset(ProbingSettings(), preset)
+    return (
+        plausible_settings(preset, 0.001) if name == "definition" else preset_settings(name, preset)
+    )
+
+
+def differences(settings, path=""):
+    """Dotted names and values of all fields in which settings of one class are not equal."""
+    for field in fields(settings[0]):
+        values = [getattr(one, field.name) for one in settings]
+        name = path + field.name
+        if all(is_dataclass(value) for value in values) and len(set(map(type, values))) == 1:
+            yield from differences(values, f"{name}.")
+        elif any(value != values[0] for value in values):
+            yield name, values
+
+
+def on_the_page():
+    """Cells of paper, reference and default by method and setting."""
+    found, of = {}, []
+    for block in PRESETS.split("\n\n"):
+        of = re.findall(r"`(\w+)`", block) if block.startswith("Of ") else of
+        for row in block.splitlines()[2:] if block.startswith("| setting | paper |") else ():
+            setting, *cells = (cell.strip("|` ") for cell in row.split(" | "))
+            assert len(cells) == 4, row
+            assert cells[3], f"{setting} has no reason"
+            assert not {(name, setting) for name in of} & set(found), row
+            found |= {(name, setting): cells[:3] for name in of}
+    return found
+
+
+def same(cell, value):
+    """Whether a cell, in YAML, shows a value; numbers to four digits."""
+    if is_dataclass(value):
+        return cell == type(value).__name__
+    shown = yaml.safe_load(cell)
+    if isinstance(shown, str) and re.fullmatch(r"[\d.]+e-?\d+", shown):
+        shown = float(shown)
+    if isinstance(value, float | tuple) and not isinstance(shown, str | None):
+        return bool(np.allclose(shown, value, rtol=1e-3, atol=0.0))
+    return type(shown) is type(value) and shown == value
+
+
+@pytest.mark.parametrize("name", [*OURS, "session", "definition"])
+def test_every_setting_in_which_presets_differ_is_on_the_page(name):
+    page = {setting: cells for (of, setting), cells in on_the_page().items() if of == name}
+    code = dict(differences([settings_of(name, one) for one in ORDER]))
+    assert sorted(page) == sorted(code)
+    for setting, values in code.items():
+        for preset, cell, value in zip(ORDER, page[setting], values, strict=True):
+            assert same(cell, value), f"{name}, {setting}, {preset}: {cell} for {value}"
+
+
+def test_printed_numbers_are_those_of_all_presets():
+    printed = {row["setting"]: float(row["value"]) for row in PRINTED.finditer(PRESETS)}
+    assert len(printed) == 7
+    for preset in ORDER:
+        settings = dict(flat(settings_mapping(settings_of("chsel", preset))))
+        assert {name: settings[name] for name in printed} == pytest.approx(printed)
+
+
+def table_rows(text):
+    lines = [line for line in text.splitlines() if re.fullmatch(r"\|.*[^-|: ].*\|", line)]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_times_in_the_readme_are_those_of_the_page_of_the_benchmark():
+    readme = (REPOSITORY / "README.md").read_text()
+    header, *rows = table_rows(readme.partition("\n## Speed\n")[2].partition("\n## ")[0])
+    measured = {(row[0], row[1]): row[2] for row in table_rows((DOCS / "speed.md").read_text())}
+    assert len(rows) >= 4
+    for row in rows:
+        (problem,) = re.findall("`(.*)`", row[0])
+        for column, cell in zip(header[1:], row[1:], strict=True):
+            name = column.replace("`", "")
+            assert cell == measured.get((problem, name), ""), f"{problem}, {column}"
