@@ -22,11 +22,10 @@ from replay.mcap.schemas import FORMAT_VERSION, RECORDS
 Change = Callable[[str, bytes], bytes | None]
 
 
-def rewritten(path: Path, change: Change, *, topics: tuple[str, ...] = ()) -> Path:
+def rewritten(path: Path, change: Change) -> Path:
     """A whole, checksummed copy of a recording with other messages or attachments.
 
-    `change` gets topic or attachment name and the bytes, and gives new bytes or None to leave out.
-    Topics in `topics` are left out altogether.
+    change: gets topic or attachment name and the bytes; gives new bytes, or None to leave out.
     """
     copy = path.with_suffix(".changed.mcap")
     with path.open("rb") as source, copy.open("wb") as target:
@@ -41,13 +40,12 @@ def rewritten(path: Path, change: Change, *, topics: tuple[str, ...] = ()) -> Pa
             writer.register_schema(schema.name, schema.encoding, schema.data)
         channels = {}
         for channel in summary.channels.values():
-            if channel.topic not in topics:
-                number = writer.register_channel(channel.topic, "protobuf", channel.schema_id)
-                channels[channel.topic] = number
+            number = writer.register_channel(channel.topic, "protobuf", channel.schema_id)
+            channels[channel.topic] = number
         sequence = 0
         for _, channel, message in reader.iter_messages():
             data = change(channel.topic, message.data)
-            if data is not None and channel.topic in channels:
+            if data is not None:
                 time = message.log_time
                 writer.add_message(channels[channel.topic], time, data, time, sequence)
                 sequence += 1
@@ -83,11 +81,6 @@ def test_problems_are_rebuilt_from_the_file_alone(events, write):
         assert problem.low_cost_set.tobytes() == posed[step].low_cost_set.tobytes()
         assert problem.key == posed[step].key
     assert len(recording.problem(2).low_cost_set) == 12
-
-
-def test_steps_without_a_registration_are_named(events, write):
-    path = write(events)
-    recording = read_recording(path)
     with pytest.raises(RecordingError, match="no registration problem of step 0; accepted: 1, 2"):
         recording.problem(0)
     with pytest.raises(RecordingError, match="no result of step 7; accepted: 1, 2"):
@@ -189,7 +182,6 @@ def test_an_event_cut_from_its_points_is_left_out(events, write, assert_same):
     ("content", "message"),
     [
         (b"", "is not an MCAP file; accepted: a recording.mcap that this project wrote"),
-        (b"ply\nformat ascii 1.0\n", "is not an MCAP file"),
         (MCAP0_MAGIC, "is unfinished"),
         (MCAP0_MAGIC * 2, "is damaged after byte"),
     ],
@@ -248,19 +240,13 @@ def test_a_changed_attachment_has_another_digest(events, write, name):
         (edited("/known_points", new_digest="0"), "new points of step -1 has digest"),
         (edited("/known_points", occupied=9), "occupied points of step -1 are missing"),
         (edited("/session", config="[1]"), "its configuration is not a mapping"),
-        (edited("/session", config="{"), "Expecting property name"),
         (edited("/session", workspace=np.ones((2, 3))), "every lower bound below"),
-        (edited("/session", object="\x1b[2J"), r"object holds the character '\\x1b' at 0"),
-        (edited("/session", free_resolution=1e-12), "free_resolution is 1e-12; accepted"),
         (edited("/session", world_from_object=np.eye(4) * 3.0), "is not a rigid transform"),
-        (edited("/probe", outcome="gone"), "accepted: contact, free, points"),
         (edited("/probe", step=1), "has a time of step 0, not its own"),
         (edited("/trace", lowest_cost=1e12), "accepted: lowest, median, highest"),
         (edited("/problem", sdf_digest="0"), "the SDF grid of the problem of step 1"),
-        (edited("/session_ended", outcome="fine"), "accepted: finished, interrupted, failed"),
         (drop("/points/occupied"), "occupied points of step 0 are missing"),
         (drop("/probe"), "/points/free is out of place"),
-        (drop("/session", "/points/free", "/known_points"), "a message on /log is out of place"),
         (drop("/archive"), "the archive of step 1 is missing"),
         (drop("/hypotheses"), "the low-cost set of step 2 is missing"),
     ],
@@ -270,23 +256,13 @@ def test_content_that_contradicts_itself_is_refused(events, write, change, messa
         read_recording(rewritten(write(events), change))
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        edited("/problem", initial_set=np.eye(4)[None]),
-        edited("/problem", key_seed=1),
-        edited("/problem", free_resolution=0.03),
-        edited("/problem", low_cost_set=np.eye(4)[None]),
-        edited("/problem", workspace=np.array([[0.0] * 3, [1.0] * 3])),
-        edited("/problem", digest="0"),
-    ],
-)
-def test_a_problem_that_is_not_the_recorded_one_is_refused(events, write, change):
-    recording = read_recording(rewritten(write(events), change))
-    with pytest.raises(RecordingError, match="the problem of step 2 has digest"):
-        recording.problem(2)
-    with pytest.raises(RecordingError, match="the problem of step 1 has digest"):
-        list(recording.events())
+def test_a_problem_that_is_not_the_recorded_one_is_refused(events, write):
+    for change in (edited("/problem", initial_set=np.eye(4)[None]), edited("/problem", key_seed=1)):
+        recording = read_recording(rewritten(write(events), change))
+        with pytest.raises(RecordingError, match="the problem of step 2 has digest"):
+            recording.problem(2)
+        with pytest.raises(RecordingError, match="the problem of step 1 has digest"):
+            list(recording.events())
 
 
 def test_a_lost_message_is_noticed_though_all_checksums_hold(events, write):
