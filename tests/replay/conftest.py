@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -188,6 +189,16 @@ def with_decisions(events: list[Event], *, actions: int = 4, poses: int = 3) -> 
             points = points.merged(event.new_points)
         made.append(event)
     return made
+
+
+def nth(events: Iterable[Event], kind: type, number: int = 0) -> Any:
+    """One of the events of a kind."""
+    return [event for event in events if isinstance(event, kind)][number]
+
+
+def changed(events: list[Event], old: Event, **values: Any) -> list[Event]:
+    """The events with other values of one of them."""
+    return [dataclasses.replace(event, **values) if event is old else event for event in events]
 
 
 def same_bits(a: Any, b: Any) -> bool:

@@ -7,7 +7,6 @@ import dataclasses
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,11 +18,11 @@ from replay.__main__ import main
 from replay.comparing.choices import POLICY, chosen
 from replay.comparing.differences import result_differences
 from replay.comparing.verification import DIFFERS, EQUAL, Verdict, verify
-from replay.events import Decided, Event, ProblemPosed
-from replay.mcap.reader import Recording, read_recording
+from replay.events import Decided, Event, ProblemPosed, SessionStarted
+from replay.mcap.reader import read_recording
 from replay.verbs.compare import policy_decisions
 from replay.verbs.info import recording_info
-from tests.replay.conftest import same_bits
+from tests.replay.conftest import changed, nth, same_bits
 from tests.tools.small_recordings import STEERED, steered_session
 
 
@@ -33,14 +32,7 @@ def path(steered, write):
 
 
 def decided(events: list[Event], step: int) -> Decided:
-    return next(e for e in events if isinstance(e, Decided) and e.step == step)
-
-
-def with_decision(events: list[Event], step: int, **changes: Any) -> list[Event]:
-    """The events with other values in a decision."""
-    old = decided(events, step)
-    new = dataclasses.replace(old, decision=dataclasses.replace(old.decision, **changes))
-    return [new if event is old else event for event in events]
+    return nth(events, Decided, step + 1)
 
 
 def differing(path: Path) -> list[Verdict]:
@@ -64,10 +56,11 @@ def test_a_surprise_starts_the_next_registration_afresh_in_replays_too(write):
 
 
 def test_the_first_candidate_with_another_score_is_named(steered, write, capsys):
-    score = decided(steered, 1).decision.score.copy()
+    old = decided(steered, 1)
+    score = old.decision.score.copy()
     last = int(np.flatnonzero(np.isfinite(score))[-1])
     score[last] += 0.25
-    path = write(with_decision(steered, 1, score=score))
+    path = write(changed(steered, old, decision=dataclasses.replace(old.decision, score=score)))
     (found,) = differing(path)
     assert (found.step, found.before, found.stage) == (1, 4, "score")
     assert main(["verify", str(path)]) == 1
@@ -103,18 +96,16 @@ def test_another_belief_and_surprise_are_named(steered, write):
     weights = np.array([0.5, 0.5, *np.zeros(len(old.problem.belief) - 2)])
     belief = dataclasses.replace(old.problem.belief, weights=weights)
     problem = dataclasses.replace(old.problem, belief=belief)
-    other = dataclasses.replace(old, problem=problem, surprise=old.surprise + 1.0)
-    found = differing(write([other if event is old else event for event in steered]))[0]
+    events = changed(steered, old, problem=problem, surprise=old.surprise + 1.0)
+    found = differing(write(events))[0]
     assert found.stage == "belief"
     assert any(line.startswith("belief.weights: ") for line in found.differences)
     assert any(line.startswith("surprise: ") for line in found.differences)
 
 
 def test_a_policy_that_is_not_installed_is_named(steered, write, capsys):
-    start: Any = steered[0]
-    config = start.config | {"policy": {"name": "tea_leaves"}}
-    path = write([dataclasses.replace(start, config=config), *steered[1:]])
-    assert main(["verify", str(path)]) == 2
+    config = nth(steered, SessionStarted).config | {"policy": {"name": "tea_leaves"}}
+    assert main(["verify", str(write(changed(steered, steered[0], config=config)))]) == 2
     shown = capsys.readouterr().err
     assert re.fullmatch(r"error: .*tea_leaves.*accepted: .*\n", shown)
 
@@ -177,13 +168,10 @@ def test_decisions_are_exported_in_three_forms(steered_events, write, tmp_path):
         assert same_bits(arrays[f"step_{event.step}/poses"], event.problem.belief.object_from_world)
 
 
-def rows_of(recording: Recording, step: int, *words: str) -> list[dict[str, Any]]:
-    return list(policy_decisions(recording, chosen(recording, POLICY, words), [step]))
-
-
 def test_others_decide_on_the_recorded_problem(path):
     recording, others = read_recording(path), ("voxel_entropy", "nearest_mean", "grid")
-    recorded, *rows = rows_of(recording, 1, *others, "stop.spread=0.0", "stop.gain=0.0")
+    choices = chosen(recording, POLICY, [*others, "stop.spread=0.0", "stop.gain=0.0"])
+    recorded, *rows = policy_decisions(recording, choices, [1])
     assert recorded["label"] == "recorded: information"
     assert recorded["chosen"] == recording.decision(1).decision.chosen
     for name, row in zip(others, rows, strict=True):
@@ -194,16 +182,6 @@ def test_others_decide_on_the_recorded_problem(path):
         assert row["score"] == expected.score[action]
         assert row["blocked_chance"] == expected.blocked_chance[action]
         assert row["as_recorded"] is (action == recorded["chosen"])
-
-
-def test_the_recorded_policy_has_its_recorded_settings(path):
-    words = ("information", "information#2", "information#2:noise=0.5")
-    recorded, again, wide = rows_of(read_recording(path), 0, *words)
-    assert again["as_recorded"]
-    numbers = ("chosen", "spread_m", "score", "hit_chance", "expected_spread_m")
-    assert [again[name] for name in numbers] == [recorded[name] for name in numbers]
-    assert wide["score"] != recorded["score"]
-    assert wide["changes"] == "noise=0.5"
 
 
 def test_start_and_direction_are_the_hands_place_and_its_z_axis(steered):

@@ -22,13 +22,7 @@ from replay.events import (
     Traced,
 )
 from replay.verbs.diff import FIRST, SECOND, recording_diff
-
-
-def changed(events: list, kind: type, number: int, **values) -> list:
-    """The events, one of a kind with other values."""
-    places = [place for place, event in enumerate(events) if isinstance(event, kind)]
-    place = places[number]
-    return [*events[:place], dataclasses.replace(events[place], **values), *events[place + 1 :]]
+from tests.replay.conftest import changed, nth
 
 
 def texts(first: Path, second: Path, *ignored: str) -> list[str]:
@@ -36,11 +30,11 @@ def texts(first: Path, second: Path, *ignored: str) -> list[str]:
 
 
 def test_a_bit_of_one_cost_is_found(events, write, capsys):
-    hypotheses = [e for e in events if isinstance(e, HypothesesFound)][1].hypotheses
-    cost = hypotheses.cost.copy()
+    found = nth(events, HypothesesFound, 1)
+    cost = found.hypotheses.cost.copy()
     cost[0] = np.nextafter(np.nextafter(cost[0], 9.0), 9.0)
-    other = dataclasses.replace(hypotheses, cost=cost)
-    first, second = write(events), write(changed(events, HypothesesFound, 1, hypotheses=other))
+    other = dataclasses.replace(found.hypotheses, cost=cost)
+    first, second = write(events), write(changed(events, found, hypotheses=other))
     assert main(["diff", str(first), str(second)]) == 1
     lines = capsys.readouterr().out.split("\n")
     assert re.fullmatch(
@@ -77,7 +71,7 @@ def test_settings_and_environment_differ_by_key(events, write, capsys):
 
 
 def test_an_event_too_many_shifts_nothing(events, write):
-    place = next(i for i, event in enumerate(events) if isinstance(event, Traced))
+    place = events.index(nth(events, Traced))
     more = [*events[:place], Traced(1, "descent", 50, "1" * 32, 0.0, 1.0, 2.0), *events[place:]]
     first, second = write(events), write(more)
     for pair, having in (((first, second), SECOND), ((second, first), FIRST)):
@@ -88,7 +82,7 @@ def test_an_event_too_many_shifts_nothing(events, write):
 def test_signed_zeros_differ_and_equal_nan_do_not(events, write):
     def with_values(*values: float) -> Path:
         numbers = {f"number_{index}": value for index, value in enumerate(values)}
-        return write(changed(events, Measured, 0, values=numbers))
+        return write(changed(events, nth(events, Measured), values=numbers))
 
     first = with_values(0.0, math.nan, 1.0, math.inf)
     found = texts(first, with_values(-0.0, math.nan, 1.0 + 2.0**-52, -math.inf))
@@ -102,9 +96,7 @@ def test_signed_zeros_differ_and_equal_nan_do_not(events, write):
 
 def test_mesh_grid_points_and_pixels_are_compared_by_number(sensor_events, write):
     kinds = (SessionStarted, RigDescribed, SensorImage, Probe)
-    start, rig, image, probe = (
-        next(event for event in sensor_events if isinstance(event, kind)) for kind in kinds
-    )
+    start, rig, image, probe = (nth(sensor_events, kind) for kind in kinds)
     mesh = trimesh.Trimesh(start.mesh.vertices.copy(), start.mesh.faces, process=False)
     mesh.vertices[3, 1] = np.nextafter(mesh.vertices[3, 1], 1.0)
     grid = np.array(start.sdf.values)

@@ -15,6 +15,7 @@ from chsel.problem.settings import settings_mapping
 from replay.events import Decided
 from replay.mcap.reader import read_recording
 from runners.objects.loader import MODELS
+from tests.replay.conftest import changed, nth
 
 pytest_plugins = ["pytester"]
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"
@@ -59,12 +60,11 @@ def test_folders_of_the_configuration_alone_are_collected(pytester, stored):
 
 
 def test_a_failing_item_says_what_verify_says(pytester, steered, write, tmp_path):
-    old = next(event for event in steered if isinstance(event, Decided) and event.step == 1)
+    old = nth(steered, Decided, 2)
     decision = dataclasses.replace(old.decision, score=old.decision.score * 2.0)
-    changed = dataclasses.replace(old, decision=decision)
     folder = tmp_path / "kept"
     folder.mkdir()
-    shutil.move(write([changed if e is old else e for e in steered]), folder / "box.mcap")
+    shutil.move(write(changed(steered, old, decision=decision)), folder / "box.mcap")
     result = pytester.runpytest_inprocess("--replays", str(folder), "-v")
     result.assert_outcomes(passed=6, failed=1)
     result.stdout.fnmatch_lines(

@@ -10,17 +10,16 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from chsel.problem.registration_problem import Hypotheses
 from replay.__main__ import main
 from replay.comparing.differences import is_close
 from replay.comparing.verification import DIFFERS, EQUAL, NO_RESULT, Verdict, verified_files, verify
-from replay.events import Event, HypothesesFound, Measured, Traced
+from replay.events import Event, HypothesesFound, Measured, SessionStarted, Traced
 from replay.mcap.reader import read_recording
+from tests.replay.conftest import changed, nth
 from tests.tools.small_recordings import registered_session
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -34,30 +33,10 @@ def descent():
     return registered_session("gradient_descent")
 
 
-def result(events: list[Event], index: int = 0) -> Hypotheses:
-    return [e.hypotheses for e in events if isinstance(e, HypothesesFound)][index]
-
-
-def with_result(events: list[Event], index: int, **changes: np.ndarray) -> list[Event]:
-    """The events with another result of the index-th registration."""
-    old = result(events, index)
-    found = dataclasses.replace(old, **changes)
-    return [
-        dataclasses.replace(event, hypotheses=found)
-        if isinstance(event, HypothesesFound) and event.hypotheses is old
-        else event
-        for event in events
-    ]
-
-
 def measured(events: list[Event], step: int, change: Callable[[str, float], float]) -> list[Event]:
     """The events with other measured values of a step."""
-    return [
-        Measured(step, {name: change(name, value) for name, value in event.values.items()})
-        if isinstance(event, Measured) and event.step == step
-        else event
-        for event in events
-    ]
+    old = nth(events, Measured, step)
+    return changed(events, old, values={name: change(name, x) for name, x in old.values.items()})
 
 
 def verdicts(path: Path) -> list[Verdict]:
@@ -73,9 +52,10 @@ def test_equal_bits_are_status_0(capsys):
 
 
 def test_one_cost_that_is_one_ulp_larger_is_found(descent, write, capsys):
-    cost = result(descent, 1).cost.copy()
+    old = nth(descent, HypothesesFound, 1)
+    cost = old.hypotheses.cost.copy()
     cost[2] = np.nextafter(cost[2], 0.0)
-    path = write(with_result(descent, 1, cost=cost))
+    path = write(changed(descent, old, hypotheses=dataclasses.replace(old.hypotheses, cost=cost)))
     found = verdicts(path)
     assert [verdict.outcome for verdict in found] == [EQUAL, DIFFERS]
     assert (found[1].stage, found[1].largest_ulps) == ("choosing the hypotheses", 1)
@@ -87,32 +67,24 @@ def test_one_cost_that_is_one_ulp_larger_is_found(descent, write, capsys):
     assert "environment: " in shown
 
 
-def test_the_sign_of_a_zero_is_a_difference(descent, write):
-    poses = result(descent).object_from_world.copy()
-    assert poses[0, 3, 0] == 0.0
-    poses[0, 3, 0] = -0.0
-    (found, _) = verdicts(write(with_result(descent, 0, object_from_world=poses)))
-    assert (found.outcome, found.largest_ulps) == (DIFFERS, 1)
-
-
 def test_another_last_result_shows_in_how_the_next_sets_follow(descent, write):
     """E_0 and E_l of the next problem were not made from it; of another recording they may be."""
-    poses = result(descent).object_from_world.copy()
+    old = nth(descent, HypothesesFound)
+    poses = old.hypotheses.object_from_world.copy()
     poses[0, 0, 3] += 0.01
-    events = with_result(descent, 0, object_from_world=poses)
+    other = dataclasses.replace(old.hypotheses, object_from_world=poses)
+    events = changed(descent, old, hypotheses=other)
     found = verdicts(write(events))
     assert [verdict.outcome for verdict in found] == [DIFFERS, DIFFERS]
     assert found[1].stage == "making E_0"
-    start: Any = events[0]
-    found = verdicts(write([dataclasses.replace(start, source="0" * 32), *events[1:]]))
+    found = verdicts(write(changed(events, events[0], source="0" * 32)))
     assert [verdict.outcome for verdict in found] == [DIFFERS, EQUAL]
 
 
 def test_a_changed_trace_names_its_iteration(write):
     events = registered_session("chsel")
     traces = [e for e in events if isinstance(e, Traced) and e.stage == "cma_mega"]
-    changed = dataclasses.replace(traces[1], digest="0" * 32)
-    (found, after) = verdicts(write([changed if e is traces[1] else e for e in events]))
+    (found, after) = verdicts(write(changed(events, traces[1], digest="0" * 32)))
     assert found.stage == f"cma_mega, iteration {traces[1].iteration}"
     assert found.before > 2
     assert after.outcome == EQUAL
@@ -158,9 +130,9 @@ def test_a_registration_that_was_interrupted_has_nothing_to_compare(descent, wri
 
 
 def test_other_settings_than_those_that_gave_the_result_are_found(descent, write):
-    start: Any = descent[0]
-    config = {**start.config, "method": {**start.config["method"], "descent": {"restarts": 3}}}
-    found = verdicts(write([dataclasses.replace(start, config=config), *descent[1:]]))
+    config = nth(descent, SessionStarted).config
+    config = {**config, "method": {**config["method"], "descent": {"restarts": 3}}}
+    found = verdicts(write(changed(descent, descent[0], config=config)))
     assert {verdict.outcome for verdict in found} == {DIFFERS}
     assert "which does not come about" in found[0].stage
 

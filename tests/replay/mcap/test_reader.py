@@ -18,6 +18,7 @@ from replay.events import ProblemPosed
 from replay.mcap.encoding import decode, encode, message_class
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import FORMAT_VERSION, RECORDS
+from tests.replay.conftest import nth
 
 Change = Callable[[str, bytes], bytes | None]
 
@@ -95,12 +96,9 @@ def test_plain_mcap_and_protobuf_rebuild_a_problem(events, write):
         attachments = {item.name: item.data for item in reader.iter_attachments()}
         stored = [(c.topic, s.name, m) for s, c, m in reader.iter_messages()]
     pool = descriptor_pool.DescriptorPool()
-    added = set()
     for schema in summary.schemas.values():
         for proto in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
-            if proto.name not in added:
-                pool.Add(proto)
-                added.add(proto.name)
+            pool.Add(proto)
 
     def parsed(name, data):
         return message_factory.GetMessageClass(pool.FindMessageTypeByName(name)).FromString(data)
@@ -118,12 +116,10 @@ def test_plain_mcap_and_protobuf_rebuild_a_problem(events, write):
         if topic == "/hypotheses":
             elites = array(content.elites)
         if topic == "/problem" and content.step == 2:
-            low_cost_set = (
-                array(content.low_cost_set) if content.HasField("low_cost_set") else elites
-            )
             break
+    low_cost_set = array(content.low_cost_set) if content.HasField("low_cost_set") else elites
     grid = parsed("chsel.SdfGrid", attachments["sdf_grid"])
-    expected = next(e.problem for e in events if isinstance(e, ProblemPosed) and e.step == 2)
+    expected = nth(events, ProblemPosed, 1).problem
     known = np.concatenate(points["known"])
     for found, wanted in (
         (np.concatenate(points["free"]), expected.points.free),
@@ -146,21 +142,6 @@ def test_plain_mcap_and_protobuf_rebuild_a_problem(events, write):
     mesh = trimesh.load(io.BytesIO(attachments["mesh.ply"]), file_type="ply", process=False)
     assert mesh.vertices.tobytes() == events[0].mesh.vertices.tobytes()
     assert mesh.faces.tolist() == events[0].mesh.faces.tolist()
-
-
-def test_a_flipped_bit_in_a_chunk_is_named_and_what_is_before_it_kept(events, write, assert_same):
-    path = write(events)
-    whole = bytearray(path.read_bytes())
-    with path.open("rb") as file:
-        chunks = make_reader(file).get_summary().chunk_indexes
-    assert len(chunks) == 2
-    whole[chunks[1].chunk_start_offset + chunks[1].chunk_length // 2] ^= 4
-    path.write_bytes(whole)
-    with pytest.raises(RecordingError, match=r"is damaged after byte \d+: "):
-        read_recording(path)
-    recording = read_recording(path, partial=True)
-    assert recording.damage.startswith("damaged after byte")
-    assert_same(recording.events(), events[:1])
 
 
 def test_an_event_cut_from_its_points_is_left_out(events, write, assert_same):
@@ -265,18 +246,13 @@ def test_a_problem_that_is_not_the_recorded_one_is_refused(events, write):
             list(recording.events())
 
 
-def test_a_lost_message_is_noticed_though_all_checksums_hold(events, write):
-    """Measured values are in no digest; that they are all there follows from their numbering."""
+def test_messages_that_come_twice_are_noticed_by_their_numbers(events, write):
     path = write(events)
     whole = path.read_bytes()
     with path.open("rb") as file:
         chunk = make_reader(file).get_summary().chunk_indexes[1]
     start = chunk.chunk_start_offset
     end = start + chunk.chunk_length + chunk.message_index_length
-    path.write_bytes(whole[:start] + whole[end:])
-    with pytest.raises(RecordingError, match="damaged after byte"):
-        read_recording(path)
-    twice = path.with_name("twice.mcap")
-    twice.write_bytes(whole[:end] + whole[start:])
+    path.write_bytes(whole[:end] + whole[start:])
     with pytest.raises(RecordingError, match=r"message \d+ is missing, \d+ follows"):
-        read_recording(twice)
+        read_recording(path)

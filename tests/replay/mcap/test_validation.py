@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import struct
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -36,33 +37,23 @@ from replay.events import (
 )
 from replay.mcap.event_messages import image_values
 from replay.mcap.reader import read_recording
-from tests.replay.conftest import with_sensors
+from tests.replay.conftest import changed, nth, with_sensors
 
 Events = list[Event]
 Change = Callable[[Events], Events]
 
 
-def first(events: Events, kind: type) -> int:
-    return next(i for i, event in enumerate(events) if isinstance(event, kind))
-
-
-def changed(kind: type, /, **values: Any) -> Change:
+def first(kind: type, /, **values: Any) -> Change:
     """Other values of the first event of a kind."""
-
-    def change(events: Events) -> Events:
-        i = first(events, kind)
-        return [*events[:i], dataclasses.replace(events[i], **values), *events[i + 1 :]]
-
-    return change
+    return lambda events: changed(events, nth(events, kind), **values)
 
 
 def result(make: Callable[[Any], dict[str, Any]]) -> Change:
     """Other values of the first result, made of the old ones."""
 
     def change(events: Events) -> Events:
-        found: Any = events[first(events, HypothesesFound)]
-        other = dataclasses.replace(found.hypotheses, **make(found.hypotheses))
-        return changed(HypothesesFound, hypotheses=other)(events)
+        old = nth(events, HypothesesFound).hypotheses
+        return first(HypothesesFound, hypotheses=dataclasses.replace(old, **make(old)))(events)
 
     return change
 
@@ -76,14 +67,18 @@ def inserted(place: int, event: Event) -> Change:
     return lambda events: [*events[:place], event, *events[place:]]
 
 
+def before(kind: type, event: Event) -> Change:
+    return lambda events: inserted(events.index(nth(events, kind)), event)(events)
+
+
 def repeated(kind: type) -> Change:
-    return lambda events: inserted(first(events, kind), events[first(events, kind)])(events)
+    return lambda events: before(kind, nth(events, kind))(events)
 
 
-def moved(kind: type, before: type) -> Change:
+def moved(kind: type, behind: type) -> Change:
     def change(events: Events) -> Events:
-        event = events.pop(first(events, kind))
-        return inserted(first(events, before), event)(events)
+        event = nth(events, kind)
+        return before(behind, event)([other for other in events if other is not event])
 
     return change
 
@@ -120,14 +115,14 @@ WRONG: dict[str, Change] = {
     r"a name of values holds the character '\\x1b'": inserted(5, Measured(0, {"\x1b": 1.0})),
     "a log line holds the character": inserted(5, Logged(0, "info", "\x00")),
     # sensors
-    r"SensorImage of step 0: sensor is 'a/b'; accepted: letters, digits and _": changed(
+    r"SensorImage of step 0: sensor is 'a/b'; accepted: letters, digits and _": first(
         SensorImage, sensor="a/b"
     ),
-    "kind is 'color'; accepted: depth, deformation": changed(SensorImage, kind="color"),
-    r"unit is nan; accepted: 1e-09 to 1000 \(m\)": changed(SensorImage, unit=np.nan),
-    "intrinsics .* above 0": changed(SensorImage, intrinsics=np.array([0.0, 1.0, 2.0, 3.0])),
-    r"height is 0; accepted: 1 to 8192 \(pixels\)": changed(SensorImage, **image(0, 3)),
-    "no triangle of its vertices": changed(
+    "kind is 'color'; accepted: depth, deformation": first(SensorImage, kind="color"),
+    r"unit is nan; accepted: 1e-09 to 1000 \(m\)": first(SensorImage, unit=np.nan),
+    "intrinsics .* above 0": first(SensorImage, intrinsics=np.array([0.0, 1.0, 2.0, 3.0])),
+    r"height is 0; accepted: 1 to 8192 \(pixels\)": first(SensorImage, **image(0, 3)),
+    "no triangle of its vertices": first(
         RigDescribed, hand=trimesh.Trimesh(np.eye(3), [[0, 1, 3]], process=False)
     ),
     # order
@@ -136,9 +131,7 @@ WRONG: dict[str, Change] = {
     "/hypotheses of step 1 is in no registration of it": repeated(HypothesesFound),
     "/archive of step 1 is in no registration": moved(HypothesesFound, SnapshotTaken),
     "an event follows the end of the session": repeated(SessionEnded),
-    "step 0 follows one of step 1": lambda events: inserted(
-        first(events, ProblemPosed), Logged(0, "info", "")
-    )(events),
+    "step 0 follows one of step 1": before(ProblemPosed, Logged(0, "info", "")),
     "there is a rig of step -1; accepted: one, before all steps": repeated(RigDescribed),
     "an image of step 0 does not precede the probe of its": moved(SensorImage, SessionEnded),
     "an image of step 0 has no rig before it": without(RigDescribed),
@@ -174,7 +167,7 @@ def test_pixels_of_another_kind_are_refused(robot, write):
         ({"mask": np.zeros((5, 6), bool)}, r"mask of an image is bool \(5, 6\); accepted: bool"),
     ):
         with pytest.raises(RecordingError, match=message):
-            write(changed(SensorImage, **values)(robot))
+            write(first(SensorImage, **values)(robot))
 
 
 def test_a_diverged_start_of_infinite_cost_is_a_result(robot, write, assert_same):
@@ -265,10 +258,10 @@ def test_a_recording_gives_actions_and_decisions_back(steered_events, write, ass
     ],
 )
 def test_a_decision_that_makes_no_sense_is_not_written(steered_events, write, values, message):
-    old = next(event for event in steered_events if isinstance(event, Decided) and event.step == 0)
-    new = dataclasses.replace(old, decision=dataclasses.replace(old.decision, **values))
+    old = nth(steered_events, Decided, 1)
+    other = dataclasses.replace(old.decision, **values)
     with pytest.raises(RecordingError, match=message):
-        write([new if event is old else event for event in steered_events])
+        write(changed(steered_events, old, decision=other))
 
 
 @pytest.mark.parametrize(
@@ -285,32 +278,25 @@ def test_a_decision_stands_after_the_results_of_its_step(
     steered_events, write, kind, step, message
 ):
     """With the decision after step 1 ahead of an event."""
-    (one,) = (e for e in steered_events if isinstance(e, Decided) and e.step == 1)
+    one = nth(steered_events, Decided, 2)
     rest = [event for event in steered_events if event is not one]
     place = next(i for i, e in enumerate(rest) if isinstance(e, kind) and e.step == step)
-    if message is None:
-        write([*rest[:place], one, *rest[place:]])
-        return
-    with pytest.raises(RecordingError, match=message):
-        write([*rest[:place], one, *rest[place:]])
+    with pytest.raises(RecordingError, match=message) if message else nullcontext():
+        write(inserted(place, one)(rest))
 
 
 def test_a_decision_is_of_the_actions_and_points_before_it(steered_events, write):
-    offered = steered_events[first(steered_events, ActionsOffered)]
-    rest = [event for event in steered_events if event is not offered]
-    one, other, *_ = (event for event in steered_events if isinstance(event, Decided))
-    stale = dataclasses.replace(other, problem=one.problem)
-    for events, message in (
-        (rest, "a decision of step -1 has no actions before it"),
-        ([rest[0], offered, offered], "accepted: once, before all steps"),
-        ([rest[0], dataclasses.replace(offered, step=0)], "accepted: once, before all steps"),
+    one, other = (nth(steered_events, Decided, number) for number in (0, 1))
+    for change, message in (
+        (without(ActionsOffered), "a decision of step -1 has no actions before it"),
+        (repeated(ActionsOffered), "accepted: once, before all steps"),
         (
-            [stale if event is other else event for event in steered_events],
+            lambda events: changed(events, other, problem=one.problem),
             "points, a grid, a workspace, actions or a hand that",
         ),
     ):
         with pytest.raises(RecordingError, match=message):
-            write(events)
+            write(change(steered_events))
 
 
 def test_settings_have_upper_bounds(events):

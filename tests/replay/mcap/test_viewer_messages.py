@@ -22,6 +22,7 @@ from replay.events import Decided, HypothesesFound, Probe
 from replay.mcap.foxglove_messages import FOXGLOVE, POINT_CLASSES, VIEWS
 from replay.mcap.schemas import MESSAGES, RECORDS, STEP_TIME
 from replay.mcap.viewer_messages import CumulativePoints, next_probe, simple_mesh
+from tests.replay.conftest import nth
 
 LAYOUT = Path(replay.__file__).parent / "foxglove_layout.json"
 
@@ -53,7 +54,7 @@ def test_a_scene_holds_the_object_at_each_distinct_hypothesis(events, write):
     scene = SceneUpdate.FromString(data)
     assert scene.SerializeToString(deterministic=True) == data  # put together of bytes
     (entity,) = scene.entities
-    found = [event.hypotheses for event in events if isinstance(event, HypothesesFound)][-1]
+    found = nth(events, HypothesesFound, -1).hypotheses
     poses = inverse(found.object_from_world[~found.duplicate])
     assert len(entity.triangles) == len(poses) == 3
     box = events[0].mesh
@@ -116,7 +117,7 @@ def test_a_simple_mesh_has_few_faces_and_the_same_shape(subdivisions):
 
 
 def test_the_next_probe_is_an_arrow_from_start_to_end(steered_events):
-    first, *_, last = (event for event in steered_events if isinstance(event, Decided))
+    first, last = (nth(steered_events, Decided, number) for number in (0, -1))
     (entity,) = SceneUpdate.FromString(next_probe(first, 5)).entities
     (arrow,) = entity.arrows
     pose = first.problem.actions.world_from_hand[first.decision.chosen]
@@ -130,16 +131,9 @@ def test_the_next_probe_is_an_arrow_from_start_to_end(steered_events):
     assert len(entity.arrows) == 0
 
 
-def test_points_poses_and_the_true_pose_are_there_to_the_bit(events, write):
+def test_poses_and_the_true_pose_are_there_to_the_bit(events, write):
     path = write(events)
-    probe = next(e for e in events if isinstance(e, Probe) and e.step == 2)
-    cloud = PointCloud.FromString(messages(path, "/points/known")[-1][2])
-    values = np.frombuffer(cloud.data).reshape(-1, 4)
-    assert [field.name for field in cloud.fields] == ["x", "y", "z", "sdf"]
-    assert cloud.frame_id == "world"
-    assert values[:, :3].tobytes() == probe.new_points.known.tobytes()
-    assert values[:, 3].tobytes() == probe.new_points.sdf.tobytes()
-    found = [e.hypotheses for e in events if isinstance(e, HypothesesFound)][-1]
+    found = nth(events, HypothesesFound, -1).hypotheses
     poses = PosesInFrame.FromString(messages(path, "/hypothesis_poses")[-1][2]).poses
     positions = [[pose.position.x, pose.position.y, pose.position.z] for pose in poses]
     assert positions == inverse(found.object_from_world)[:, :3, 3].tolist()

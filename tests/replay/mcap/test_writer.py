@@ -17,6 +17,7 @@ from chsel.problem.points import KnownPoints
 from replay.events import HypothesesFound, ProblemPosed
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
+from tests.replay.conftest import changed, nth
 
 CONFTEST = Path(__file__).parents[1] / "conftest.py"
 
@@ -107,26 +108,17 @@ def test_a_recording_that_exists_is_not_overwritten_nor_a_folder_made(tmp_path):
         McapRecorder(tmp_path / "nowhere" / "recording.mcap")
 
 
-def test_a_session_starts_once_and_first(tmp_path, events):
-    recorder = McapRecorder(tmp_path / "recording.mcap")
-    with pytest.raises(RecordingError, match="as first event"):
-        recorder.record(events[1])
-    recorder.record(events[0])
-    with pytest.raises(RecordingError, match="needs one SessionStarted"):
-        recorder.record(events[0])
-
-
 def test_what_cannot_be_recorded_leaves_a_whole_file_of_all_before_it(
     tmp_path, events, assert_same
 ):
-    posed = next(i for i, event in enumerate(events) if isinstance(event, ProblemPosed))
-    problem = events[posed].problem
+    problem = nth(events, ProblemPosed).problem
+    posed = events.index(nth(events, ProblemPosed))
     extra = problem.points.merged(KnownPoints(free=[[0.0, 0.0, 0.0]]))
-    found = next(e.hypotheses for e in events if isinstance(e, HypothesesFound))
+    found = nth(events, HypothesesFound).hypotheses
     narrow = dataclasses.replace(found, cell=found.cell.astype(np.int32))
     short = dataclasses.replace(found, cost=found.cost[:4])
     for count, event, message in (
-        (posed, "no event", "str is not an event of a session"),
+        (posed, events[0], "needs one SessionStarted, as first event"),
         (
             posed,
             ProblemPosed(1, dataclasses.replace(problem, points=extra)),
@@ -161,14 +153,11 @@ def test_what_repeats_is_stored_once(make_events, write, assert_same):
 
 
 def test_an_archive_unlike_the_last_snapshot_is_stored(events, write, assert_same):
-    changed = []
-    for event in events:
-        if isinstance(event, HypothesesFound):
-            archive = dataclasses.replace(event.hypotheses.archive, refinement=2)
-            found = dataclasses.replace(event.hypotheses, archive=archive)
-            event = HypothesesFound(event.step, found)
-        changed.append(event)
-    assert_same(read_recording(write(changed)).events(), changed)
+    old = nth(events, HypothesesFound)
+    archive = dataclasses.replace(old.hypotheses.archive, refinement=2)
+    other = dataclasses.replace(old.hypotheses, archive=archive)
+    again = changed(events, old, hypotheses=other)
+    assert_same(read_recording(write(again)).events(), again)
 
 
 def test_a_removed_recording_is_told_at_the_next_flush(tmp_path, events):
