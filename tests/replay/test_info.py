@@ -6,7 +6,6 @@ import json
 
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from replay.__main__ import main
 from replay.events import HypothesesFound, ProblemPosed
@@ -95,22 +94,6 @@ def test_topics_types_counts_and_rates_of_a_log(tmp_path, capsys):
     assert main(["info", str(path)]) == 1
     output = " ".join(capsys.readouterr().out.split())
     assert "unfinished or damaged: log.mcap: a record is cut short; what is whole" in output
-
-
-def test_a_log_written_without_an_index_is_whole(tmp_path):
-    path = tmp_path / "log.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, use_chunking=False, use_statistics=False, repeat_channels=False)
-        writer.start()
-        schema = writer.register_schema("x", "jsonschema", b"{}")
-        channel = writer.register_channel("/x", "json", schema)
-        for n in range(5):
-            writer.add_message(channel, n * SECOND // 10, b"{}", 0)
-        writer.finish()
-    info = log_info(path)
-    assert info["integrity"]["whole"]
-    assert [(topic["topic"], topic["count"]) for topic in info["topics"]] == [("/x", 5)]
-    assert (info["begin"], info["end"]) == (0, 4 * SECOND // 10)
 
 
 @pytest.mark.parametrize(

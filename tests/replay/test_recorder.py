@@ -232,6 +232,12 @@ def test_new_files_are_on_the_disk_and_a_full_one_is_named(make, tmp_path, synce
     assert sorted(os.listdir(tmp_path)) == ["out.txt"]
 
 
+def test_a_link_to_nothing_is_not_written_over(tmp_path):
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(RecordingError, match="link exists"), new_file(tmp_path / "link"):
+        pass
+
+
 @pytest.mark.slow
 def test_every_reported_probe_survives_kills_at_random_moments():
     """In a process of its own: a fork needs one without the threads of other tests."""

