@@ -44,10 +44,10 @@ FREE_RESOLUTION = 0.02
 
 
 def example_events(
-    *, steps: int = 3, elites: int = 12, free: int = 40, snapshots: int = 2, seed: int = 7
+    *, steps: int = 3, elites: int = 12, free: int = 40, snapshots: int = 2
 ) -> list[Event]:
     """Events of a session with a box; step 0 has a probe in free space and no registration."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(7)
     mesh = trimesh.creation.box((0.1, 0.06, 0.04))
     start = SessionStarted(
         runner="probe",
@@ -71,15 +71,8 @@ def example_events(
         points = points.merged(probe.new_points)
         events.append(probe)
         if step > 0:
-            problem = RegistrationProblem(
-                sdf=start.sdf,
-                points=points,
-                initial_set=_poses(random, 5),
-                workspace=WORKSPACE,
-                free_resolution=FREE_RESOLUTION,
-                key=StreamKey(start.seed, step),
-                low_cost_set=low_cost_set,
-            )
+            given = (start.sdf, points, _poses(random, 5), WORKSPACE, FREE_RESOLUTION)
+            problem = RegistrationProblem(*given, StreamKey(start.seed, step), low_cost_set)
             found = _registration(random, problem, elites, snapshots)
             low_cost_set = found[-1].hypotheses.elites
             events += [*found, Timed(step, {"registration": random.uniform()})]
@@ -98,19 +91,11 @@ def bare_events() -> list[Event]:
         object="",
     )
     point = KnownPoints(occupied=[[0.0, -0.0, 5e-324]])
-    problem = RegistrationProblem(
-        start.sdf, point, np.eye(4)[None], WORKSPACE, FREE_RESOLUTION, StreamKey(0, 0)
-    )
-    nothing = Hypotheses(
-        object_from_world=np.zeros((0, 4, 4)),
-        cost=np.zeros(0),
-        duplicate=np.zeros(0, dtype=bool),
-        cell=np.zeros(0, dtype=np.int64),
-        elites=np.zeros((0, 4, 4)),
-    )
-    empty_archive = dataclasses.replace(
-        _archive(np.random.default_rng(0), 0, 0), solutions=np.zeros((0, 9))
-    )
+    given = (start.sdf, point, np.eye(4)[None], WORKSPACE, FREE_RESOLUTION)
+    problem = RegistrationProblem(*given, StreamKey(0, 0))
+    poses, flags, cells = np.zeros((0, 4, 4)), np.zeros(0, dtype=bool), np.zeros(0, dtype=np.int64)
+    nothing = Hypotheses(poses, np.zeros(0), flags, cells, poses)
+    empty_archive = _archive(np.random.default_rng(0), 0, 0)
     return [
         start,
         Probe(0, "free", KnownPoints()),
@@ -122,7 +107,7 @@ def bare_events() -> list[Event]:
     ]
 
 
-def with_sensors(events: list[Event], *, height: int = 5, width: int = 7) -> list[Event]:
+def with_sensors(events: list[Event]) -> list[Event]:
     """The same session of a robot with a camera and a pad: a rig, and images before each probe."""
     random = np.random.default_rng(11)
     hand = trimesh.creation.icosphere(subdivisions=1, radius=0.05)
@@ -130,9 +115,9 @@ def with_sensors(events: list[Event], *, height: int = 5, width: int = 7) -> lis
     for event in events:
         if isinstance(event, Probe):
             for sensor, kind in (("camera", "depth"), ("pad_1", "deformation")) * 2:
-                values = random.integers(0, 2**16, (height, width), dtype=np.uint16)
+                values = random.integers(0, 2**16, (5, 7), dtype=np.uint16)
                 pose = _poses(random, 1)[0]
-                intrinsics = np.array([500.0, 501.0, width / 2, -0.5])
+                intrinsics = np.array([500.0, 501.0, 3.5, -0.5])
                 mask = random.uniform(size=values.shape) < 0.5
                 seen = (values, 0.001, mask, intrinsics, pose)
                 made.append(SensorImage(event.step, sensor, kind, *seen))
@@ -142,9 +127,9 @@ def with_sensors(events: list[Event], *, height: int = 5, width: int = 7) -> lis
     return made
 
 
-def with_decisions(events: list[Event], *, actions: int = 4, poses: int = 3) -> list[Event]:
+def with_decisions(events: list[Event]) -> list[Event]:
     """The same session steered: actions are offered, and a decision follows each step's results."""
-    random = np.random.default_rng(13)
+    random, actions, poses = np.random.default_rng(13), 4, 3
     starting = sum(isinstance(event, SessionStarted | RigDescribed) for event in events)
     start = events[0]
     start = dataclasses.replace(start, config={**start.config, "policy": {"name": "dice"}})
@@ -168,17 +153,9 @@ def with_decisions(events: list[Event], *, actions: int = 4, poses: int = 3) -> 
             *random.uniform(size=(3, actions)),
             contacts=np.zeros((0, 3)) if stop else contacts,
         )
-        problem = DecisionProblem(
-            start.sdf,
-            points,
-            start.workspace,
-            start.free_resolution,
-            belief,
-            offered,
-            available,
-            hand,
-            StreamKey(start.seed, probed + 1),
-        )
+        given = (start.sdf, points, start.workspace, start.free_resolution)
+        key = StreamKey(start.seed, probed + 1)
+        problem = DecisionProblem(*given, belief, offered, available, hand, key)
         return Decided(probed, problem, decision, random.uniform(0.0, 9.0))
 
     for event in events[starting:]:
@@ -279,11 +256,6 @@ def _archive(random: np.random.Generator, iteration: int, elites: int) -> Archiv
 @pytest.fixture
 def events():
     return example_events()
-
-
-@pytest.fixture
-def make_events():
-    return example_events
 
 
 @pytest.fixture

@@ -112,8 +112,8 @@ def test_a_whole_recording_is_copied_and_nothing_is_lost(
 
 
 @pytest.mark.parametrize("damage", [flipped, wrong_length])
-def test_of_a_damaged_chunk_all_other_probes_come_back(tmp_path, make_events, assert_same, damage):
-    many = make_events(steps=6, free=400)
+def test_of_a_damaged_chunk_all_other_probes_come_back(tmp_path, assert_same, damage):
+    many = example_events(steps=6, free=400)
     data = recorded(tmp_path / "whole.mcap", many)
     chunks = chunks_of(data, "/probe")
     assert len(chunks) == 6

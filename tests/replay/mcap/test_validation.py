@@ -32,7 +32,7 @@ from replay.events import (
     Timed,
 )
 from replay.mcap.reader import read_recording
-from tests.replay.conftest import changed, nth, with_sensors
+from tests.replay.conftest import changed, example_events, nth, with_sensors
 
 Events = list[Event]
 Change = Callable[[Events], Events]
@@ -132,9 +132,9 @@ WRONG: dict[str, Change] = {
 
 
 @pytest.fixture
-def robot(make_events):
+def robot():
     """A session of two probes, with sensors and a registration."""
-    return with_sensors(make_events(steps=2, free=3))
+    return with_sensors(example_events(steps=2, free=3))
 
 
 @pytest.mark.parametrize("message", WRONG)

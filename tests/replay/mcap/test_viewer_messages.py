@@ -22,7 +22,7 @@ from replay.events import Decided, HypothesesFound, Probe
 from replay.mcap.foxglove_messages import FOXGLOVE, POINT_CLASSES, VIEWS
 from replay.mcap.schemas import MESSAGES, RECORDS, STEP_TIME
 from replay.mcap.viewer_messages import CumulativePoints, next_probe, simple_mesh
-from tests.replay.conftest import nth
+from tests.replay.conftest import example_events, nth
 
 LAYOUT = Path(replay.__file__).parent / "foxglove_layout.json"
 
@@ -79,8 +79,8 @@ def test_the_object_is_drawn_where_its_frame_is(events, write):
     assert not messages(write(unknown), "/object_mesh", "/object_surface")
 
 
-def test_the_last_clouds_of_all_topics_hold_all_points_known_at_that_time(make_events, write):
-    events = make_events(steps=12, free=5)
+def test_the_last_clouds_of_all_topics_hold_all_points_known_at_that_time(write):
+    events = example_events(steps=12, free=5)
     path = write(events)
     known = events[0].initial_points
     clouds = messages(path, *(topic for topic in VIEWS if topic.startswith("/all_points/")))

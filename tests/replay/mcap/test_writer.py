@@ -17,7 +17,7 @@ from chsel.problem.points import KnownPoints
 from replay.events import HypothesesFound, ProblemPosed
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
-from tests.replay.conftest import changed, nth
+from tests.replay.conftest import changed, example_events, nth
 
 CONFTEST = Path(__file__).parents[1] / "conftest.py"
 
@@ -142,8 +142,8 @@ def test_what_cannot_be_recorded_leaves_a_whole_file_of_all_before_it(
         path.unlink()
 
 
-def test_what_repeats_is_stored_once(make_events, write, assert_same):
-    events = make_events(elites=200, snapshots=1)
+def test_what_repeats_is_stored_once(write, assert_same):
+    events = example_events(elites=200, snapshots=1)
     path = write(events)
     stored = [len(message.data) for message in messages(path, "/hypotheses")]
     assert max(stored) < 200 * 16 * 8 + 3_000  # the elites, without the archive

@@ -13,6 +13,7 @@ from chsel.problem.trust import trust_in
 from replay.comparing.comparison import common_cost, numbers_under
 from replay.mcap.reader import Recording, read_recording
 from replay.rerun.comparison_view import ranked, save_comparison
+from tests.replay.conftest import example_events
 from tests.tools.rrd_rows import read, shown_at, shown_poses
 
 pytestmark = pytest.mark.filterwarnings("ignore:no node of the SDF is deeper")  # a thin box
@@ -21,9 +22,9 @@ AWKWARD = "Ωther/way, b=½ {x} \\"
 
 
 @pytest.fixture
-def recording(make_events, write):
+def recording(write):
     """Registrations at steps 1 to 3 of four probes."""
-    return read_recording(write(make_events(steps=4)))
+    return read_recording(write(example_events(steps=4)))
 
 
 @pytest.fixture
