@@ -6,9 +6,6 @@ import ast
 import tokenize
 from pathlib import Path
 
-ALIASES = {"bless": "accept"}
-"""Former names of verbs, which keep working."""
-
 
 def _summary(module: Path) -> str:
     """The first line of a module, which is read, not imported: that would take seconds."""

@@ -270,11 +270,9 @@ def steered_events():
 
 @pytest.fixture(params=["all", "bare", "start alone"])
 def any_events(request):
-    if request.param == "bare":
-        return bare_events()
     if request.param == "all":
         return with_decisions(with_sensors(example_events(steps=2)))
-    return example_events()[:1]
+    return bare_events() if request.param == "bare" else example_events()[:1]
 
 
 @pytest.fixture

@@ -145,7 +145,6 @@ def test_changes_reach_the_methods_that_have_the_setting(path):
     ("words", "message"),
     [
         (["magic"], "method is 'magic'; accepted: chsel, "),
-        (["chsel@best"], "preset is 'best'; accepted: default, paper, reference"),
         (["chsel", "chsel"], "chsel is named twice; accepted: NAME, NAME@PRESET"),
         (["chsel#"], "'chsel#' is not a method"),
         (["chsel", "emitter.iteration=3"], "chsel: method.emitter.iteration does not exist; did"),

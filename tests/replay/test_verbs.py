@@ -18,7 +18,7 @@ from replay.__main__ import main
 from replay.arguments import chosen_steps
 from replay.console import Console, print_error, print_warning, printable
 from replay.mcap.reader import read_recording
-from replay.verbs import ALIASES, VERBS
+from replay.verbs import VERBS
 from runners.sensors.depth_frame import read_depth_frame
 from runners.sensors.pose_file import read_pose
 from runners.sessions.points import read_points
@@ -28,14 +28,6 @@ from tests.tools.verb_arguments import verb_arguments
 REPLAY = Path(__file__).resolve().parents[1] / "replays" / "spam_can_icp.mcap"
 HOSTILE = "x[/x] [red]:smile: \x1b]0;title\x07\x1b[31m\x9b\u202e.mcap"
 SHOWN = "x[/x] [red]:smile: \\x1b]0;title\\x07\\x1b[31m\\x9b\\u202e.mcap"
-
-
-def test_former_names_are_those_of_verbs(capsys):
-    for former, verb in ALIASES.items():
-        for name in (former, verb):
-            with pytest.raises(SystemExit):
-                main([name, "--help"])
-        assert capsys.readouterr().out.count(VERBS[verb].split(",")[0]) == 2
 
 
 EXISTING = (2, 3, 5, 8, 9)

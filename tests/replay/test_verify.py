@@ -158,7 +158,6 @@ def test_several_files_and_processes_give_the_same_verdicts(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere.mcap"], "recording nowhere.mcap does not exist"),
         ([str(DESCENT), "--step", "3"], "has no registration problem of step 3; accepted: 8, 9"),
         ([str(DESCENT), "--jobs", "0"], "--jobs is 0; accepted: an integer from 1 to 256"),
         ([str(Path(__file__).parent)], "has no recordings; accepted: files *.mcap in it"),

@@ -159,29 +159,20 @@ def test_an_event_cut_from_its_points_is_left_out(events, write, assert_same):
     assert_same(read_recording(cut, partial=True).events(), events[:2])
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
+def test_other_files_are_refused(tmp_path):
+    path, others = tmp_path / "recording.mcap", io.BytesIO()
+    writer = Writer(others)
+    writer.start("ros2", "")
+    writer.finish()
+    for content, message in (
         (b"", "is not an MCAP file; accepted: a recording.mcap that this project wrote"),
         (MCAP0_MAGIC, "is unfinished"),
         (MCAP0_MAGIC * 2, "is damaged after byte"),
-    ],
-)
-def test_other_files_are_refused(tmp_path, content, message):
-    path = tmp_path / "recording.mcap"
-    path.write_bytes(content)
-    with pytest.raises(RecordingError, match=message):
-        read_recording(path)
-
-
-def test_recordings_of_other_programs_are_refused(tmp_path):
-    path = tmp_path / "other.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "")
-        writer.finish()
-    with pytest.raises(RecordingError, match="is another program's"):
-        read_recording(path)
+        (others.getvalue(), "is another program's"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(RecordingError, match=message):
+            read_recording(path)
 
 
 def drop(*names: str) -> Change:
@@ -199,18 +190,6 @@ def test_another_format_version_is_named_before_all_else(events, write):
 
     with pytest.raises(RecordingError, match="it is of format 2; accepted: 1"):
         read_recording(rewritten(write(events), newer))
-
-
-@pytest.mark.parametrize("name", ["mesh.ply", "sdf_grid"])
-def test_a_changed_attachment_has_another_digest(events, write, name):
-    def nudged(found: str, data: bytes) -> bytes:
-        if found != name:
-            return data
-        position = data.index(b"end_header\n") + 11 if name == "mesh.ply" else len(data) - 8
-        return data[:position] + bytes([data[position] ^ 1]) + data[position + 1 :]
-
-    with pytest.raises(RecordingError, match=f"attachment {name} has digest .* not .* as recorded"):
-        read_recording(rewritten(write(events), nudged))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.errors import RecordingError
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import compose, inverse, random_rotations
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
@@ -312,11 +311,6 @@ def test_large_images_are_thinned_out_for_the_eye():
     assert small.mask.tolist() == large.mask[::4, ::4].tolist()
     assert small.intrinsics.tolist() == [2.0, 2.25, 0.625, 0.375]
     assert display_size(depth(0)).values.shape == (4, 6)
-
-
-def test_a_place_that_cannot_be_written_is_named(tmp_path):
-    with pytest.raises(RecordingError, match=r"cannot be written .*accepted: a new \.rrd file"):
-        RerunRecorder(tmp_path)
 
 
 def test_without_a_viewer_the_live_view_is_a_warning(tmp_path, monkeypatch):
