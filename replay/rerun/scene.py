@@ -34,10 +34,6 @@ if TYPE_CHECKING:
 
     from chsel.next_probe.decision_problem import HandShape
 
-if TYPE_CHECKING:
-    import trimesh
-
-
 NORMAL_LENGTH = 0.035  # in diagonals of the workspace
 CUMULATIVE = ("free", "occupied", "contacts", "contacts/normals", "known", "gripper/past")
 """What each probe adds to: a view shows these over all probes up to the moment."""
@@ -73,18 +69,10 @@ class Scene:
         )
         self._stream.log("scene/workspace", box, static=True)
         if world_from_object is not None:
-            self.add_mesh("object", mesh, world_from_object, (*OBJECT, 255))
-
-    def add_mesh(
-        self,
-        name: str,
-        mesh: trimesh.Trimesh,
-        world_from_mesh: FloatArray,
-        color: tuple[int, int, int, int],
-    ) -> None:
-        """A mesh at one pose (4, 4) all the time."""
-        pose = rr.Transform3D(translation=world_from_mesh[:3, 3], mat3x3=world_from_mesh[:3, :3])
-        self._stream.log(f"scene/{name}", display_mesh(mesh, color), pose, static=True)
+            where, turn = world_from_object[:3, 3], world_from_object[:3, :3]
+            pose = rr.Transform3D(translation=where, mat3x3=turn)
+            drawn = display_mesh(mesh, (*OBJECT, 255))
+            self._stream.log("scene/object", drawn, pose, static=True)
 
     def add_hand(self, hand: trimesh.Trimesh | HandShape) -> None:
         """The hand, which probes show where they are deepest."""

@@ -68,7 +68,7 @@ def test_the_recorded_method_gives_the_recorded_bits_and_says_where_they_are_fro
 
 
 def test_another_method_with_other_settings_is_recorded_as_such(recording, step, capsys):
-    words = ("gradient_descent", "cost.free_scale=40", "preset=paper")
+    words = ("gradient_descent@paper", "cost.free_scale=40")
     assert step("--step", "1", "--method", *words) == 0
     assert "gradient_descent@paper with cost.free_scale=40" in capsys.readouterr().out
     again = read_recording("session_step1_gradient_descent.mcap")

@@ -203,7 +203,6 @@ def test_another_format_version_is_named_before_all_else(events, write):
         (edited("/session", workspace=np.ones((2, 3))), "every lower bound below"),
         (edited("/session", world_from_object=np.eye(4) * 3.0), "is not a rigid transform"),
         (edited("/probe", step=1), "has a time of step 0, not its own"),
-        (edited("/trace", lowest_cost=1e12), "accepted: lowest, median, highest"),
         (edited("/problem", sdf_digest="0"), "the SDF grid of the problem of step 1"),
         (drop("/points/occupied"), "occupied points of step 0 are missing"),
         (drop("/probe"), "/points/free is out of place"),
