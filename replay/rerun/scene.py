@@ -69,10 +69,18 @@ class Scene:
         )
         self._stream.log("scene/workspace", box, static=True)
         if world_from_object is not None:
-            where, turn = world_from_object[:3, 3], world_from_object[:3, :3]
-            pose = rr.Transform3D(translation=where, mat3x3=turn)
-            drawn = display_mesh(mesh, (*OBJECT, 255))
-            self._stream.log("scene/object", drawn, pose, static=True)
+            self.add_mesh("object", mesh, world_from_object, (*OBJECT, 255))
+
+    def add_mesh(
+        self,
+        name: str,
+        mesh: trimesh.Trimesh,
+        world_from_mesh: FloatArray,
+        color: tuple[int, int, int, int],
+    ) -> None:
+        """A mesh at one pose (4, 4) all the time."""
+        pose = rr.Transform3D(translation=world_from_mesh[:3, 3], mat3x3=world_from_mesh[:3, :3])
+        self._stream.log(f"scene/{name}", display_mesh(mesh, color), pose, static=True)
 
     def add_hand(self, hand: trimesh.Trimesh | HandShape) -> None:
         """The hand, which probes show where they are deepest."""

@@ -104,8 +104,9 @@ def _compare_methods(given: argparse.Namespace, recording: Recording) -> int:
     cost = common_cost(recording)
     found = compared(recording, methods, steps, cost, sets, out=given.out)
     waiting = Console(stderr=True)
-    bar = {"console": waiting, "transient": True, "disable": not waiting.is_terminal}
-    outcomes = list(track(found, "registering", len(steps) * (len(methods) + 1), **bar))
+    count, hidden = len(steps) * (len(methods) + 1), not waiting.is_terminal
+    bar = track(found, "registering", count, console=waiting, transient=True, disable=hidden)
+    outcomes = list(bar)
     rows, console = frame(outcomes, methods, cost, given.definition), Console()
     columns = {n: c for n, c in COLUMNS.items() if c.heading and rows[c.csv_name].notna().any()}
     others = [column for name, column in columns.items() if name not in _PLAUSIBLE]
