@@ -27,17 +27,18 @@ from replay.comparing.choices import METHOD, chosen, is_recorded, recorded_metho
 from replay.comparing.comparison import common_cost, compared, recorded_label
 from replay.events import SessionStarted
 from replay.mcap.reader import read_recording
-from tests.tools.small_recordings import METHODS, registered_session, write_recording
+from tests.tools.small_recordings import registered_session, write_recording
 
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"
 OFFSET = (0.02, 0.0, 0.15)
+COST = {"penetration_tolerance": -0.005, "known_scale": 4.0}
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     """A recording of two registrations of a box, whose true pose is said to be elsewhere."""
     path = tmp_path_factory.mktemp("compare") / "recording.mcap"
-    start, *events = registered_session("chsel")
+    start, *events = registered_session("chsel", cost=COST)
     pose = np.eye(4)
     pose[:3, 3] = OFFSET
     assert isinstance(start, SessionStarted)
@@ -75,7 +76,7 @@ def test_the_recorded_method_finds_the_recorded_bits_and_the_others_their_own(
 def test_all_sets_are_judged_by_the_recorded_cost(path):
     recording = read_recording(path)
     cost = common_cost(recording)
-    assert cost.settings == dataclasses.replace(CostSettings(), **METHODS["chsel"]["cost"])
+    assert cost.settings == dataclasses.replace(CostSettings(), **COST)
     methods = chosen(recording, METHOD, ["chsel", "chsel@paper"])
     outcomes = list(compared(recording, methods, recording.steps, cost))
     labels = [recorded_label(recording), "chsel", "chsel@paper"]

@@ -59,9 +59,12 @@ METHODS: dict[str, dict[str, Any]] = {
 }
 
 
-def registered_session(name: str, *, seed: int = 3) -> list[Event]:
-    """The events of two steps of a box, each registered by a method of METHODS."""
-    method = build_method(name, METHODS[name])
+def registered_session(name: str, *, seed: int = 3, **changes: Any) -> list[Event]:
+    """The events of two steps of a box, each registered by a method of METHODS.
+
+    changes: of groups of its settings.
+    """
+    method = build_method(name, METHODS[name] | changes)
     random = np.random.default_rng(seed)
     start = _start(random, name, method, seed)
     recorder = ListRecorder()
