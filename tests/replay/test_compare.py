@@ -27,7 +27,7 @@ from replay.comparing.choices import METHOD, chosen, is_recorded, recorded_metho
 from replay.comparing.comparison import common_cost, compared, recorded_label
 from replay.events import SessionStarted
 from replay.mcap.reader import read_recording
-from tests.tools.small_recordings import registered_session, write_recording
+from tests.tools.small_recordings import METHODS, registered_session, write_recording
 
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"
 OFFSET = (0.02, 0.0, 0.15)
@@ -38,7 +38,9 @@ COST = {"penetration_tolerance": -0.005, "known_scale": 4.0}
 def path(tmp_path_factory):
     """A recording of two registrations of a box, whose true pose is said to be elsewhere."""
     path = tmp_path_factory.mktemp("compare") / "recording.mcap"
-    start, *events = registered_session("chsel", cost=COST)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(METHODS["chsel"], "cost", COST)
+        start, *events = registered_session("chsel")
     pose = np.eye(4)
     pose[:3, 3] = OFFSET
     assert isinstance(start, SessionStarted)

@@ -5,12 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rerun.blueprint.components import PlayState
 from rerun.chunk import RrdReader
-
-from chsel.problem.poses import compose
-from replay.rerun.scene import LEVELS
 
 Row = tuple[dict[str, int], dict[str, Any]]
 """Times by timeline, and values by component."""
@@ -45,16 +41,9 @@ def shown_at(rows: list[Row], step: int) -> dict[str, Any]:
     return shown
 
 
-def shown_poses(rows: dict[str, list[Row]], root: str, step: int) -> dict[float, np.ndarray]:
-    """The poses (4, 4) at which hypotheses are shown at a probe, by their costs."""
-    poses: dict[float, np.ndarray] = {}
-    for entity in ("best", *(f"cost_step_{level + 1}" for level in range(LEVELS))):
-        row = shown_at(rows[f"{root}/{entity}"], step)
-        places = row["InstancePoses3D:translations"], row["InstancePoses3D:mat3x3"]
-        for cost, where, turn in zip(row["cost"], *places, strict=True):
-            if not np.isnan(cost):  # turn: column by column
-                poses[cost] = compose(np.reshape(turn, (3, 3)).T, np.array(where))
-    return poses
+def until_probe(rows: list[Row], step: int) -> list[dict[str, Any]]:
+    """What a view at a probe draws from: the last value counts."""
+    return [values for times, values in rows if times.get("probe", step + 1) <= step]
 
 
 def last_layout(path: Path) -> list[dict[str, Any]]:

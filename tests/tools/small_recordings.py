@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from chsel.methods import build_method
+from chsel.methods import build_method, trust_by
 from chsel.methods.method import Method
 from chsel.next_probe.decision_problem import Actions, HandShape
+from chsel.plausible.pose_metrics import result_numbers
 from chsel.policies import build_policy
 from chsel.policies.steering import Steering
 from chsel.problem.online_registration import OnlineRegistration, pose_problem
@@ -25,7 +26,9 @@ from replay.events import (
     ActionsOffered,
     Decided,
     Event,
+    HypothesesFound,
     Logged,
+    Measured,
     Probe,
     ProblemPosed,
     RigDescribed,
@@ -59,12 +62,9 @@ METHODS: dict[str, dict[str, Any]] = {
 }
 
 
-def registered_session(name: str, *, seed: int = 3, **changes: Any) -> list[Event]:
-    """The events of two steps of a box, each registered by a method of METHODS.
-
-    changes: of groups of its settings.
-    """
-    method = build_method(name, METHODS[name] | changes)
+def registered_session(name: str, *, seed: int = 3) -> list[Event]:
+    """The events of two steps of a box, each registered by a method of METHODS."""
+    method = build_method(name, METHODS[name])
     random = np.random.default_rng(seed)
     start = _start(random, name, method, seed)
     recorder = ListRecorder()
@@ -209,3 +209,28 @@ def _probe(random: np.random.Generator, step: int) -> Probe:
         known_sdf=np.repeat([0.0, 0.01], 5),
     )
     return Probe(step, "contact", new, np.eye(4)[None].repeat(2, axis=0), surface, normals)
+
+
+def measured_again(events: Iterable[Event], method: Method | None = None) -> list[Event]:
+    """The events with the measured values that follow from their results by today's definition.
+
+    method: that found them, for how far they are trusted; None: without.
+    """
+    found: list[Event] = []
+    start: Any = None
+    problem: Any = None
+    hypotheses: Any = None
+    for event in events:
+        if isinstance(event, SessionStarted):
+            start = event
+        elif isinstance(event, ProblemPosed):
+            problem = event.problem
+        elif isinstance(event, HypothesesFound):
+            hypotheses = event.hypotheses
+        elif isinstance(event, Measured):
+            truth, symmetry = start.world_from_object, symmetry_for_errors(start)
+            trust = None if method is None else trust_by(method, problem, hypotheses)
+            numbers = result_numbers(hypotheses, problem, truth, symmetry, trust)
+            event = Measured(event.step, numbers)
+        found.append(event)
+    return found

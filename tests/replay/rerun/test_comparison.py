@@ -14,7 +14,8 @@ from replay.comparing.comparison import common_cost, numbers_under
 from replay.mcap.reader import Recording, read_recording
 from replay.rerun.comparison_view import ranked, save_comparison
 from tests.replay.conftest import example_events
-from tests.tools.rrd_rows import read, shown_at, shown_poses
+from tests.replay.rerun.test_recorder import shown_poses
+from tests.tools.rrd_rows import read, shown_at
 
 pytestmark = pytest.mark.filterwarnings("ignore:no node of the SDF is deeper")  # a thin box
 

@@ -34,7 +34,7 @@ from replay.rerun import viewer as rerun_viewer
 from replay.rerun.rerun_recorder import RerunRecorder
 from replay.rerun.scene import LEVELS, cost_levels
 from replay.rerun.sensors import display_size
-from tests.tools.rrd_rows import Row, at_probe, read, shown_at, shown_poses
+from tests.tools.rrd_rows import Row, at_probe, read, shown_at
 
 WORKSPACE = Workspace((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
 MESH = trimesh.creation.box(extents=(0.1, 0.2, 0.3))
@@ -151,6 +151,18 @@ def write(path: Path, events: Iterable[Event]) -> Path:
         recorder.record(event)
     recorder.close()
     return path
+
+
+def shown_poses(rows: dict[str, list[Row]], root: str, step: int) -> dict[float, np.ndarray]:
+    """The poses (4, 4) at which hypotheses are shown at a probe, by their costs."""
+    poses: dict[float, np.ndarray] = {}
+    for entity in ("best", *(f"cost_step_{level + 1}" for level in range(LEVELS))):
+        row = shown_at(rows[f"{root}/{entity}"], step)
+        places = row["InstancePoses3D:translations"], row["InstancePoses3D:mat3x3"]
+        for cost, where, turn in zip(row["cost"], *places, strict=True):
+            if not np.isnan(cost):  # turn: column by column
+                poses[cost] = compose(np.reshape(turn, (3, 3)).T, np.array(where))
+    return poses
 
 
 @pytest.fixture(scope="module")
