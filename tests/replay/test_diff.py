@@ -119,7 +119,6 @@ def test_mesh_grid_points_and_pixels_are_compared_by_number(sensor_events, write
         r"/sensor_image, step 0, camera: values: 1 of 35 entries, the first at 17",
         r"/probe, step 0: new_points.free: 1 of 120 numbers by up to 1 ulp .*, the first at 1",
     )
-    assert len(found) == 4
     for pattern, text in zip(patterns, found, strict=True):
         assert re.fullmatch(pattern, text)
     assert texts(first, second, "mesh", "sdf", "/probe", "/sensor_image") == []

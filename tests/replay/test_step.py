@@ -95,7 +95,6 @@ def test_a_problem_without_a_result_can_be_registered(session, write, tmp_path, 
     [
         (("--step", "2"), "there is no step 2; accepted: 0, 1"),
         (("--step", "1", "--method", "a", "b"), "--method names a and b; accepted: one, then"),
-        (("--step", "1", "--method", "emitter.iteration=4"), "iteration does not exist"),
     ],
 )
 def test_what_does_not_exist_is_named(step, capsys, words, message):

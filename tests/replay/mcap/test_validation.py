@@ -111,9 +111,6 @@ WRONG: dict[str, Change] = {
     "kind is 'color'; accepted: depth, deformation": first(SensorImage, kind="color"),
     r"unit is nan; accepted: 1e-09 to 1000 \(m\)": first(SensorImage, unit=np.nan),
     "intrinsics .* above 0": first(SensorImage, intrinsics=np.array([0.0, 1.0, 2.0, 3.0])),
-    r"height is 0; accepted: 1 to 8192 \(pixels\)": first(
-        SensorImage, values=np.zeros((0, 3), np.uint16), mask=np.zeros((0, 3), bool)
-    ),
     "no triangle of its vertices": first(
         RigDescribed, hand=trimesh.Trimesh(np.eye(3), [[0, 1, 3]], process=False)
     ),
