@@ -98,7 +98,7 @@ WRONG: dict[str, Change] = {
     ),
     "cell is out of range; accepted: -1 to -1": result(lambda e: {"archive": None}),
     "has cells out of order": archive(cells=np.zeros(12, dtype=np.int64)),
-    "has 2 axes, but names": archive(measure_names=("x",)),
+    "has 2 axes, but names": archive(measure_names=("x",), refinement=2),
     "objectives has a number that is not finite": archive(objectives=np.full(12, np.nan)),
     # numbers and texts
     "seconds has a number that": inserted(5, Timed(0, {"a": np.inf})),
