@@ -14,7 +14,7 @@ from typing import NoReturn
 from chsel.errors import ChselError
 from replay.console import print_error, print_warning
 from replay.startup import package_version, ready
-from replay.verbs import ALIASES, VERBS
+from replay.verbs import VERBS
 
 TRACEBACK = "--traceback"
 COMPLETES = "_ARGCOMPLETE"
@@ -75,19 +75,17 @@ def _parser(verb: str) -> Parser:
     version = f"chsel-replay {package_version()}"
     parser.add_argument("--version", action="version", version=version)
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    aliases = {name: [old for old, new in ALIASES.items() if new == name] for name in VERBS}
     for name, summary in VERBS.items():
-        module = _module(name) if verb in (name, *aliases[name]) else None
+        module = _module(name) if name == verb else None
         described = module.__doc__ if module else summary
-        of = verbs.add_parser(name, aliases=aliases[name], help=summary, description=described)
+        of = verbs.add_parser(name, help=summary, description=described)
         if module:
             module.add_arguments(of)
     return parser
 
 
 def _module(verb: str) -> ModuleType:
-    """The module of a verb, by its name or a former one."""
-    return importlib.import_module(f"replay.verbs.{ALIASES.get(verb, verb)}")
+    return importlib.import_module(f"replay.verbs.{verb}")
 
 
 def _message(error: Exception) -> str:

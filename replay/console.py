@@ -11,7 +11,6 @@ from typing import IO, Any
 import rich.console
 import rich.progress
 from rich.box import SIMPLE_HEAD
-from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
@@ -85,10 +84,6 @@ class Console(rich.console.Console):
         options |= {"markup": False, "emoji": False}
         return super().render_str(printable(text, keep="\n"), **options)
 
-    def status(self, status: Any, **options: Any) -> Status:
-        """A line that stays while something is done."""
-        return _PlainStatus(_plain(status), console=self, **options)
-
 
 def plain_table(
     title: str = "", *, texts: Sequence[str] = (), numbers: Sequence[str] = ()
@@ -129,12 +124,3 @@ class TextColumn(rich.progress.TextColumn):
     def render(self, task: rich.progress.Task) -> Text:
         """The text of a task."""
         return Text(printable(self.text_format.format(task=task)))
-
-
-class _PlainStatus(Status):
-    def update(self, status: Any = None, **options: Any) -> None:
-        super().update(None if status is None else _plain(status), **options)
-
-
-def _plain(text: Any) -> Any:
-    return Text(printable(text)) if isinstance(text, str) else text

@@ -6,7 +6,7 @@ Recordings are also collected where pytest walks by itself, if the folder is nam
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,10 +55,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 class StoredReplay(pytest.File):
     """One recording, read once to be collected and once to be run."""
 
-    def __init__(self, **more: Any) -> None:
-        super().__init__(**more)
-        self._coming: Iterator[Verdict] | None = None
-        self._verdicts: dict[str, Verdict] = {}
+    _verdicts: Mapping[str, Verdict] = {}
 
     def collect(self) -> Iterable[pytest.Item]:
         """An item for each registration that has a result, and for each decision.
@@ -93,23 +90,16 @@ class StoredReplay(pytest.File):
             yield ReplayedItem.from_parent(self, name=name, step=step)
 
     def verdict(self, name: str) -> Verdict:
-        """The verdict of an item; those on other selected steps come before it."""
-        if self._coming is None:
+        """The verdict of an item; with the first come those of all selected steps."""
+        from replay.comparing.verification import verify
+        from replay.mcap.reader import read_recording
+
+        if not self._verdicts:
             items = (item for item in self.session.items if item.parent is self)
             steps = [item.step for item in items if isinstance(item, ReplayedItem)]
-            self._coming = _verdicts(self.path, steps)
-        while name not in self._verdicts:
-            verdict = next(self._coming)
-            self._verdicts[verdict.label] = verdict
+            found = verify(read_recording(self.path), steps)
+            self._verdicts = {verdict.label: verdict for verdict in found}
         return self._verdicts[name]
-
-
-def _verdicts(path: Path, steps: list[int]) -> Iterator[Verdict]:
-    """Verdicts on steps of a file that is read now, and released with the last."""
-    from replay.comparing.verification import verify
-    from replay.mcap.reader import read_recording
-
-    yield from verify(read_recording(path), steps)
 
 
 class ReplayedItem(pytest.Item):

@@ -93,12 +93,7 @@ def recorded_online(recording: Recording, method: Method) -> OnlineRegistration:
 
 def symmetry_for_errors(start: SessionStarted) -> ObjectSymmetry | None:
     """The symmetries of a session's object; None if no true pose is known to need them."""
-    return None if start.world_from_object is None else recorded_symmetry(start)
-
-
-def recorded_symmetry(start: SessionStarted) -> ObjectSymmetry:
-    """The symmetries of a session's object."""
-    return object_symmetry(start.mesh)
+    return None if start.world_from_object is None else object_symmetry(start.mesh)
 
 
 def snapshot_interval(snapshots: Sequence[ArchiveSnapshot]) -> int:

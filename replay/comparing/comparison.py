@@ -21,6 +21,7 @@ from chsel.plausible.plausible_set import PlausibleSet, read_plausible
 from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.plausible.pose_metrics import closest_pose, plausible_diversity, pose_errors
 from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance, surface_points
+from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.settings import PRESETS, in_preset
 from chsel.problem.streams import StreamKey
@@ -33,7 +34,6 @@ from replay.mcap.reader import Recording
 from replay.mcap.writer import McapRecorder
 from replay.registration import (
     Registered,
-    recorded_symmetry,
     register_recorded,
     snapshot_interval,
     symmetry_for_errors,
@@ -217,7 +217,7 @@ def numbers_under(
     numbers["best_cost"] = float(costs[best])
     numbers["median_cost"] = float(np.median(costs))
     if start.world_from_object is not None:
-        symmetry = recorded_symmetry(start)
+        symmetry = object_symmetry(start.mesh)
         position, rotation = pose_errors(poses, start.world_from_object, symmetry)
         closest = closest_pose(poses, start.world_from_object, start.sdf)
         for name, index in (("best", best), ("closest", closest)):

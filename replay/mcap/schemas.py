@@ -19,7 +19,6 @@ from replay.mcap.validation import (
     check_decision,
     check_hand,
     check_hypotheses,
-    check_trace,
     distribution,
     finite,
     intrinsics,
@@ -233,6 +232,5 @@ TOGETHER: Mapping[str, Callable[[Mapping[str, Any]], None]] = {
     "Decision": check_decision,
     "Hypotheses": check_hypotheses,
     "Rig": check_hand,
-    "Trace": check_trace,
 }
 """What the values of a message must be together; raises RecordingError."""

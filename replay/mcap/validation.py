@@ -191,16 +191,6 @@ def check_decision(made: Mapping[str, Any]) -> None:
         raise RecordingError("a contact is not finite; accepted: finite numbers, or NaN alone")
 
 
-def check_trace(trace: Mapping[str, Any]) -> None:
-    """Raise RecordingError unless the costs of a message `Trace` are in order."""
-    costs = (trace["lowest_cost"], trace["median_cost"], trace["highest_cost"])
-    if not costs[0] <= costs[1] <= costs[2]:
-        raise RecordingError(
-            f"{trace['stage']}, iteration {trace['iteration']} has the costs {costs}; "
-            "accepted: lowest, median, highest"
-        )
-
-
 def check_archive(archive: Mapping[str, Any]) -> None:
     """Raise RecordingError unless axes and cells of a message `ArchiveSnapshot` fit together."""
     from chsel.qd.selection import MOST_CELLS

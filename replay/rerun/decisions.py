@@ -18,12 +18,6 @@ if TYPE_CHECKING:
 
 _ARROW = 0.06  # longest arrow of an action, in diagonals of the box around all their starts
 _WIDTHS = (0.75, 0.35)  # radii of the arrows of actions that can be taken and that cannot, points
-_STOPPED = {
-    "spread": "the spread is small enough",
-    "gain": "no action promises enough",
-    "actions": "no action is left",
-    "budget": "the budget is spent",
-}
 
 
 class Decisions:
@@ -103,7 +97,7 @@ def _text(event: Decided) -> str:
     decision = event.decision
     spread = f"spread {number(MILLIMETRES * decision.spread)} mm"
     if decision.chosen < 0:
-        return f"stop, {_STOPPED.get(decision.stop, decision.stop)}: {spread}"
+        return f"stop by {decision.stop}: {spread}"
     expected = MILLIMETRES * decision.expected_spread[decision.chosen]
     return (
         f"next action {decision.chosen} of {len(decision.score)}: "

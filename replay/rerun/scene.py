@@ -34,10 +34,6 @@ if TYPE_CHECKING:
 
     from chsel.next_probe.decision_problem import HandShape
 
-if TYPE_CHECKING:
-    import trimesh
-
-
 NORMAL_LENGTH = 0.035  # in diagonals of the workspace
 CUMULATIVE = ("free", "occupied", "contacts", "contacts/normals", "known", "gripper/past")
 """What each probe adds to: a view shows these over all probes up to the moment."""

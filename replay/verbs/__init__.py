@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import ast
-import tokenize
 from pathlib import Path
-
-ALIASES = {"bless": "accept"}
-"""Former names of verbs, which keep working."""
 
 
 def _summary(module: Path) -> str:
     """The first line of a module, which is read, not imported: that would take seconds."""
-    with module.open("rb") as file:
-        tokens = tokenize.tokenize(file.readline)
-        documented = next(token.string for token in tokens if token.type == tokenize.STRING)
-    return str(ast.literal_eval(documented)).partition("\n")[0]
+    return (ast.get_docstring(ast.parse(module.read_bytes())) or "").partition("\n")[0]
 
 
 VERBS = {

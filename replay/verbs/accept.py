@@ -7,7 +7,8 @@ import dataclasses
 import math
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from rich.table import Table
 
 from chsel.errors import RecordingError
 from chsel.plausible.pose_metrics import pose_errors
-from chsel.plausible.symmetry import ObjectSymmetry
+from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import Hypotheses
 from replay.comparing.again import Again, made_again, result_in
@@ -28,7 +29,6 @@ from replay.files import sync_folder
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.recovery import tells_loss
 from replay.mcap.writer import McapRecorder
-from replay.registration import recorded_symmetry
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,37 +75,25 @@ def _table(title: str, changes: Sequence[ResultChange]) -> Table:
     """A row for each registration whose result changes."""
     table = plain_table(title, texts=["step", "up to", "best pose moves", *_NUMBERS])
     for change in changes:
-        pairs = [(shown(change.recorded), shown(change.new)) for shown in _NUMBERS.values()]
-        table.add_row(
-            str(change.verdict.step),
-            f"{change.verdict.largest_ulps:.3g} ulp",
-            _distance(*change.moved),
-            *(old if old == new else f"{old} -> {new}" for old, new in pairs),
-        )
+        position, rotation = change.moved
+        cells = [str(change.verdict.step), f"{change.verdict.largest_ulps:.3g} ulp"]
+        cells.append(f"{1e3 * position:.2f} mm {math.degrees(rotation):.2f}°")
+        for name, form, unit in _NUMBERS.values():
+            values = (unit * of.get(name, math.nan) for of in (change.recorded, change.new))
+            old, new = ("-" if math.isnan(value) else f"{value:{form}}" for value in values)
+            cells.append(old if old == new else f"{old} -> {new}")
+        table.add_row(*cells)
     return table
 
 
-def _distance(position: float, rotation: float) -> str:
-    """Metres and radians for people."""
-    return f"{1000.0 * position:.2f} mm {math.degrees(rotation):.2f}°"
-
-
-def _number(name: str, form: str) -> Callable[[Mapping[str, float]], str]:
-    return lambda numbers: f"{numbers[name]:{form}}" if name in numbers else "-"
-
-
-def _error(numbers: Mapping[str, float]) -> str:
-    names = ("best_position_error", "best_rotation_error")
-    return _distance(*(numbers[name] for name in names)) if names[0] in numbers else "-"
-
-
 _NUMBERS = {
-    "best cost": _number("best_cost", ".5g"),
-    "distinct": _number("distinct_hypotheses", ".0f"),
-    "error of the best": _error,
-    "PD, mm²": _number("diversity", ".4g"),
+    "best cost": ("best_cost", ".5g", 1.0),
+    "distinct": ("distinct_hypotheses", ".0f", 1.0),
+    "error, mm": ("best_position_error", ".2f", 1e3),
+    "error, °": ("best_rotation_error", ".2f", math.degrees(1.0)),
+    "PD, mm²": ("diversity", ".4g", 1.0),
 }
-"""Columns of the table, with what they show of a result."""
+"""Columns of the table: a number of a result, its form, and what turns it into the unit shown."""
 
 
 @dataclass(frozen=True)
@@ -126,13 +114,13 @@ def write_accepted(recording: Recording, path: Path) -> list[ResultChange]:
     """Write the recording with today's results to a new file; how each result differs.
 
     Registrations follow from today's results; decisions are of the recorded probes, whatever they
-    choose. The file is removed again if that fails. Raises RecordingError if the recording was
-    recovered with losses, behind which E_0 and E_l do not follow from what is left.
+    choose. Raises RecordingError if the recording was recovered with losses, behind which E_0 and
+    E_l do not follow from what is left.
     """
-    recorder, changes = McapRecorder(path), []
+    changes: list[ResultChange] = []
     seconds: dict[int, Timed] = {}
     differing, sets = environment_differences(recording.start), PlausibleSets(recording)
-    try:
+    with closing(McapRecorder(path)) as recorder:
         for event in made_again(recording, anew=True):
             if isinstance(event, Again):
                 changes.append(_change(recording, event, sets, differing))
@@ -150,11 +138,6 @@ def write_accepted(recording: Recording, path: Path) -> list[ResultChange]:
             elif isinstance(event, Timed):
                 event = seconds.get(event.step, event)
             recorder.record(event)
-        recorder.close()
-    except BaseException:
-        recorder.close()
-        os.unlink(path)
-        raise
     return changes
 
 
@@ -170,7 +153,7 @@ def _change(
         _measured(events) | sets.numbers(problem, found)
         for events, found in ((again.recorded, recorded), (again.today, new))
     )
-    symmetry = recorded_symmetry(recording.start)
+    symmetry = object_symmetry(recording.start.mesh)
     return ResultChange(verdict, old, now, best_pose_moves(recorded, new, symmetry))
 
 

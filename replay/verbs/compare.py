@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from rich.progress import BarColumn, MofNCompleteColumn
+from rich.progress import track
 from rich.table import Table
 
 from chsel.errors import ChselError, RecordingError, SettingError
@@ -38,7 +38,7 @@ from replay.comparing.comparison import (
     recorded_label,
     write_csv,
 )
-from replay.console import Console, Progress, TextColumn, plain_table
+from replay.console import Console, plain_table
 from replay.files import new_file, require_folder, require_new
 from replay.mcap.reader import Recording, read_recording
 
@@ -103,7 +103,10 @@ def _compare_methods(given: argparse.Namespace, recording: Recording) -> int:
     sets = PlausibleSets(recording, given.plausible, given.definition)
     cost = common_cost(recording)
     found = compared(recording, methods, steps, cost, sets, out=given.out)
-    outcomes = list(_shown(found, methods, steps))
+    waiting = Console(stderr=True)
+    count, hidden = len(steps) * (len(methods) + 1), not waiting.is_terminal
+    bar = track(found, "registering", count, console=waiting, transient=True, disable=hidden)
+    outcomes = list(bar)
     rows, console = frame(outcomes, methods, cost, given.definition), Console()
     columns = {n: c for n, c in COLUMNS.items() if c.heading and rows[c.csv_name].notna().any()}
     others = [column for name, column in columns.items() if name not in _PLAUSIBLE]
@@ -169,21 +172,6 @@ def _checked_outputs(given: argparse.Namespace) -> list[Path]:
                 f"{given.save_plot} is not the name of a picture; accepted: {accepted}"
             )
     return outputs
-
-
-def _shown(
-    outcomes: Iterator[Outcome], methods: Sequence[Choice[Method]], steps: Sequence[int]
-) -> Iterator[Outcome]:
-    """The outcomes, with a bar while they come."""
-    waiting = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(
-        *columns, console=waiting, transient=True, disable=not waiting.is_terminal
-    ) as progress:
-        task = progress.add_task("registering", total=len(steps) * (len(methods) + 1))
-        for outcome in outcomes:
-            progress.update(task, advance=1, description=f"step {outcome.step}")
-            yield outcome
 
 
 def _print_tables(

@@ -11,6 +11,7 @@ import inspect
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,18 +35,7 @@ from replay.verbs.info import step_rows
 
 FORMATS = ("npz", "csv", "json")
 _OF_HYPOTHESES = ("object_from_world", "cost", "duplicate", "cell")
-_OF_ARCHIVES = (
-    "iteration",
-    "refinement",
-    "measure_names",
-    "shape",
-    "lower",
-    "upper",
-    "cells",
-    "objectives",
-    "measures",
-    "solutions",
-)
+_OF_ARCHIVES = tuple(field.name for field in fields(ArchiveSnapshot))
 _OF_IMAGES = ("values", "unit", "mask", "intrinsics", "world_from_camera")
 _OF_ACTIONS = ("score", "hit_chance", "blocked_chance", "expected_spread")
 _OF_DECISIONS = ("chosen", "stop", "spread", *_OF_ACTIONS, "contacts")

@@ -28,8 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar=("NAME", "KEY=VALUE"),
-        help=f"one of {', '.join(METHODS)}, by default the recorded one; then settings such as "
-        "cost.free_scale=40, or preset=NAME",
+        help=f"one of {', '.join(METHODS)}, or NAME@PRESET, by default the recorded one; then "
+        "settings such as cost.free_scale=40",
     )
     parser.add_argument(
         "--policy",
@@ -66,11 +66,8 @@ def run(given: argparse.Namespace) -> int:
     if len(names) > 1:
         raise SettingError(f"--method names {' and '.join(names)}; accepted: one, then KEY=VALUE")
     label = names[0] if names else read_recording(given.file).start.method
-    presets = [word for word in given.method if word.startswith("preset=")]
-    changes = [word for word in given.method if "=" in word and word not in presets]
     default = f"{given.file.stem}_step{given.step}_{label.partition('@')[0]}.mcap"
-    label += "".join(f"@{word.removeprefix('preset=')}" for word in presets[:1])
-    asked.methods = [label, *changes]
+    asked.methods = [label, *(word for word in given.method if "=" in word)]
     asked.out = given.out or Path(default)
     return compare.run(asked)
 

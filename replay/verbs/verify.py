@@ -19,7 +19,7 @@ from replay.comparing.verification import (
     recordings_in,
     verified_files,
 )
-from replay.console import Console, Progress, print_error
+from replay.console import Console, print_error
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,13 +39,9 @@ def run(given: argparse.Namespace) -> int:
     console = Console(soft_wrap=True)
     paths = recordings_in(given.files)
     begun, files = time.perf_counter(), []
-    # One console for both, so that results are printed above the bar.
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("verifying", total=len(paths) if len(paths) > 1 else None)
-        for file in verified_files(paths, given.step, jobs=given.jobs):
-            progress.advance(task)
-            _print(console, file)
-            files.append(file)
+    for file in verified_files(paths, given.step, jobs=given.jobs):
+        _print(console, file)
+        files.append(file)
     if len(paths) > 1:
         outcomes = [v.outcome for file in files for v in file.compared(decisions=False)]
         equal = f"{outcomes.count(EQUAL)} of {len(outcomes)} steps equal"

@@ -11,16 +11,14 @@ from contextlib import suppress
 from pathlib import Path
 
 from chsel.errors import RecordingError
-from replay.arguments import path_argument
-from replay.console import Console
+from replay.arguments import chosen_steps, path_argument
+from replay.console import Console, print_warning
 from replay.files import require_new
-from replay.mcap.reader import Recording, read_recording
+from replay.mcap.reader import read_recording
 from replay.rerun.rerun_recorder import draw_recording
 from replay.rerun.viewer import has_screen, web_server, window
 
 _STEP_HELP = "last probe to show, by default that of the recording"
-
-
 _ENDINGS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
@@ -44,19 +42,18 @@ def run(given: argparse.Namespace) -> int:
             f"there is no screen to show {given.file} on; accepted: --save OUT.rrd, or --web"
         )
     recording = read_recording(given.file, partial=True)
-    _check_step(recording, given.step)
+    if given.step is not None:
+        chosen_steps(str(given.step), [probe.step for probe in recording.probes])
     console = Console()
     if recording.damage is not None:
-        warnings = Console(stderr=True)
-        what = f"warning: {given.file} is {recording.damage}; what is whole of it is shown"
-        warnings.print(what, soft_wrap=True)
+        print_warning(f"{given.file} is {recording.damage}; what is whole of it is shown")
     if given.save is not None:
-        _draw(recording, given.save, given.step)
+        draw_recording(recording, given.save, last=given.step)
         console.print(str(given.save), soft_wrap=True)
         return 0
     with tempfile.TemporaryDirectory(prefix="replay-view-") as folder:
         rrd = Path(folder) / "recording.rrd"
-        _draw(recording, rrd, given.step)
+        draw_recording(recording, rrd, last=given.step)
         for number in _ENDINGS:  # that end the viewer and remove the folder, too
             signal.signal(number, lambda number, _: sys.exit(128 + number))
         if given.web:
@@ -75,21 +72,3 @@ def _show_in_browser(rrd: Path, console: Console) -> None:
         if has_screen():  # else a browser for text might take the terminal over
             webbrowser.open(address)
         server.wait()
-
-
-def _draw(recording: Recording, path: Path, last: int | None) -> None:
-    progress = Console(stderr=True)
-    if progress.is_terminal:
-        with progress.status(f"drawing {len(recording.probes)} probes"):
-            draw_recording(recording, path, last=last)
-    else:
-        draw_recording(recording, path, last=last)
-
-
-def _check_step(recording: Recording, step: int | None) -> None:
-    steps = sorted({probe.step for probe in recording.probes})
-    if step is not None and step not in steps:
-        accepted = f"{steps[0]} to {steps[-1]}" if steps else "none"
-        raise RecordingError(
-            f"recording {recording.path} has no probe {step}; accepted: {accepted}"
-        )

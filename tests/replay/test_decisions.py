@@ -1,4 +1,4 @@
-"""Decisions of steered sessions, made again: `verify`, `accept` and the plugin of pytest."""
+"""Decisions of steered sessions: made again, exported, and beside those of other policies."""
 
 from __future__ import annotations
 
@@ -6,28 +6,24 @@ import csv
 import dataclasses
 import json
 import re
-import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
+from chsel.next_probe.decision_problem import Actions
 from chsel.policies import build_policy
+from chsel.problem.poses import axis_angle, compose
 from replay.__main__ import main
+from replay.comparing.choices import POLICY, chosen
+from replay.comparing.differences import result_differences
 from replay.comparing.verification import DIFFERS, EQUAL, Verdict, verify
-from replay.events import Decided, Event, Probe, ProblemPosed
+from replay.events import Decided, Event, ProblemPosed, SessionStarted
 from replay.mcap.reader import read_recording
-from replay.mcap.recovery import recover
-from replay.mcap.viewer_messages import next_probe
-from replay.mcap.writer import McapRecorder
+from replay.verbs.compare import policy_decisions
 from replay.verbs.info import recording_info
-from tests.replay.conftest import same_bits
-from tests.replay.mcap.test_recovery import chunks_of
-from tests.tools.small_recordings import steered_session, write_recording
-
-pytest_plugins = ["pytester"]
+from tests.replay.conftest import changed, nth, same_bits
+from tests.tools.small_recordings import STEERED, steered_session
 
 
 @pytest.fixture
@@ -36,21 +32,14 @@ def path(steered, write):
 
 
 def decided(events: list[Event], step: int) -> Decided:
-    return next(e for e in events if isinstance(e, Decided) and e.step == step)
-
-
-def with_decision(events: list[Event], step: int, **changes: Any) -> list[Event]:
-    """The events with other values in a decision."""
-    old = decided(events, step)
-    new = dataclasses.replace(old, decision=dataclasses.replace(old.decision, **changes))
-    return [new if event is old else event for event in events]
+    return nth(events, Decided, step + 1)
 
 
 def differing(path: Path) -> list[Verdict]:
     return [found for found in verify(read_recording(path)) if found.outcome == DIFFERS]
 
 
-@pytest.mark.parametrize("policy", ["information", "voxel_entropy", "random", "nearest_mean"])
+@pytest.mark.parametrize("policy", ["information", "random"])  # with forecasts, and by chance
 def test_decisions_are_equal_where_they_were_made(policy, write):
     path = write(steered_session(policy=policy))
     found = list(verify(read_recording(path)))
@@ -67,10 +56,11 @@ def test_a_surprise_starts_the_next_registration_afresh_in_replays_too(write):
 
 
 def test_the_first_candidate_with_another_score_is_named(steered, write, capsys):
-    score = decided(steered, 1).decision.score.copy()
+    old = decided(steered, 1)
+    score = old.decision.score.copy()
     last = int(np.flatnonzero(np.isfinite(score))[-1])
     score[last] += 0.25
-    path = write(with_decision(steered, 1, score=score))
+    path = write(changed(steered, old, decision=dataclasses.replace(old.decision, score=score)))
     (found,) = differing(path)
     assert (found.step, found.before, found.stage) == (1, 4, "score")
     assert main(["verify", str(path)]) == 1
@@ -81,33 +71,24 @@ def test_the_first_candidate_with_another_score_is_named(steered, write, capsys)
     )
 
 
-def slightly(value: Any) -> Any:
-    """Another value: the next number up, another text, or a wrong index."""
-    if isinstance(value, str):
-        return "gain"
-    return value - 1 if isinstance(value, int) else np.nextafter(value, 9.0)
-
-
 @pytest.mark.parametrize(
     "name",
     [
         *("spread", "score", "hit_chance", "blocked_chance", "expected_spread"),
-        *("chosen", "contacts", "surprise"),
+        *("chosen", "stop", "contacts", "surprise"),
     ],
 )
-def test_what_differs_is_named(steered, write, name):
+def test_what_differs_is_named(steered, name):
     made = decided(steered, 0)
-    if name == "surprise":
-        other = dataclasses.replace(made, surprise=slightly(made.surprise))
-        events = [other if event is made else event for event in steered]
-    else:
-        value = slightly(getattr(made.decision, name))
-        if name == "chosen":  # one that could be taken
-            value = int(np.argsort(made.decision.score)[-2])
-        events = with_decision(steered, 0, **{name: value})
-    found = next(verdict for verdict in differing(write(events)) if verdict.is_decision)
-    assert (found.step, found.stage) == (0, name.replace("_", " "))
-    assert found.differences[0].startswith(f"{name}: ")
+    of = made if name == "surprise" else made.decision
+    old = getattr(of, name)
+    value = old + 1 if name == "chosen" else "gain" if name == "stop" else np.nextafter(old, 9.0)
+    other = dataclasses.replace(of, **{name: value})
+    if name != "surprise":
+        other = dataclasses.replace(made, decision=other)
+    found = result_differences([made], [other])
+    assert found.stage == name.replace("_", " ")
+    assert found.lines[0].startswith(f"{name}: ")
 
 
 def test_another_belief_and_surprise_are_named(steered, write):
@@ -115,86 +96,38 @@ def test_another_belief_and_surprise_are_named(steered, write):
     weights = np.array([0.5, 0.5, *np.zeros(len(old.problem.belief) - 2)])
     belief = dataclasses.replace(old.problem.belief, weights=weights)
     problem = dataclasses.replace(old.problem, belief=belief)
-    other = dataclasses.replace(old, problem=problem, surprise=old.surprise + 1.0)
-    changed = [other if event is old else event for event in steered]
-    found = differing(write(changed))[0]
+    events = changed(steered, old, problem=problem, surprise=old.surprise + 1.0)
+    found = differing(write(events))[0]
     assert found.stage == "belief"
     assert any(line.startswith("belief.weights: ") for line in found.differences)
     assert any(line.startswith("surprise: ") for line in found.differences)
 
 
-def rate_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have `information` rate every action half as high again."""
-    policy = type(build_policy("information"))
-    rate = policy.rate
-    monkeypatch.setattr(policy, "rate", lambda _, *given: 1.5 * rate(*given))
-
-
-def test_a_policy_that_rates_otherwise_differs_in_its_scores(path, monkeypatch):
-    rate_more(monkeypatch)
-    assert {verdict.stage for verdict in differing(path)} == {"score"}
-
-
 def test_a_policy_that_is_not_installed_is_named(steered, write, capsys):
-    start: Any = steered[0]
-    config = start.config | {"policy": {"name": "tea_leaves"}}
-    path = write([dataclasses.replace(start, config=config), *steered[1:]])
-    assert main(["verify", str(path)]) == 2
+    config = nth(steered, SessionStarted).config | {"policy": {"name": "tea_leaves"}}
+    assert main(["verify", str(write(changed(steered, steered[0], config=config)))]) == 2
     shown = capsys.readouterr().err
-    assert "tea_leaves" in shown
-    assert "accepted: " in shown
-    assert shown.count("\n") == 1
+    assert re.fullmatch(r"error: .*tea_leaves.*accepted: .*\n", shown)
 
 
 def test_accepted_decisions_are_those_that_verify_then_expects(path, monkeypatch, capsys):
-    before = path.read_bytes()
+    policy = type(build_policy("information"))
+    rate = policy.rate
+    monkeypatch.setattr(policy, "rate", lambda _, *given: 1.5 * rate(*given))
+    assert {verdict.stage for verdict in differing(path)} == {"score"}
     assert main(["accept", str(path), "--yes"]) == 0
-    assert "nothing to change" in capsys.readouterr().out
-    assert path.read_bytes() == before
-    rate_more(monkeypatch)
-    assert main(["accept", str(path), "--yes"]) == 0
-    shown = capsys.readouterr().out
-    assert "4 of 7 results are new" in shown
+    assert "4 of 7 results are new" in capsys.readouterr().out
     assert not differing(path)
 
 
-def test_each_decision_is_an_item_of_pytest(pytester, steered, write, tmp_path):
-    folder = tmp_path / "kept"
-    folder.mkdir()
-    score = decided(steered, 1).decision.score * 2.0
-    shutil.move(write(with_decision(steered, 1, score=score)), folder / "box.mcap")
-    result = pytester.runpytest_inprocess("--replays", str(folder), "-v")
-    result.assert_outcomes(passed=6, failed=1)
-    result.stdout.fnmatch_lines(["*box.mcap::decision after step 1, information FAILED*"])
-    result.stdout.fnmatch_lines(["*score: * of 8 numbers by up to *"])
-
-
-def test_a_recovered_recording_is_verified_as_far_as_it_goes(steered, tmp_path):
+def test_a_recovered_recording_is_verified_as_far_as_it_goes(steered, write):
     lost = decided(steered, 0)
-    path = tmp_path / "lost.mcap"
-    write_recording(path, [event for event in steered if event is not lost])
-    found = list(verify(read_recording(path)))
+    found = list(verify(read_recording(write([e for e in steered if e is not lost]))))
     assert {verdict.outcome for verdict in found} == {EQUAL}
     assert len(found) == 6
 
 
-@pytest.fixture
-def decisions(steered_events):
-    return [event for event in steered_events if isinstance(event, Decided)]
-
-
-def flushed(path: Path, events: list[Event]) -> bytes:
-    """A recording with a chunk for each decision, and one for each probe with its results."""
-    recorder = McapRecorder(path)
-    for event in events:
-        if isinstance(event, Probe | Decided):
-            recorder.flush()
-        recorder.record(event)
-    recorder.close()
-    return path.read_bytes()
-
-
-def test_info_names_the_policy_and_how_it_stopped(steered_events, events, write, capsys):
+def test_info_names_the_policy_and_how_it_stopped(steered_events, write, capsys):
     path = write(steered_events)
     last = read_recording(path).decision(2).decision
     expected = {"name": "dice", "stop": "spread", "spread": last.spread}
@@ -206,10 +139,9 @@ def test_info_names_the_policy_and_how_it_stopped(steered_events, events, write,
     cut = [e for e in steered_events if not isinstance(e, Decided) or e.step < 2]
     unknown = {"name": "dice", "stop": None, "spread": None}
     assert recording_info(write(cut))["policy"] == unknown
-    assert recording_info(write(events))["policy"] is None
 
 
-def test_decisions_are_exported_in_three_forms(steered_events, decisions, write, tmp_path):
+def test_decisions_are_exported_in_three_forms(steered_events, write, tmp_path):
     path = str(write(steered_events))
     outs = {name: tmp_path / f"out.{name}" for name in ("csv", "json", "npz")}
     for out in outs.values():
@@ -218,6 +150,7 @@ def test_decisions_are_exported_in_three_forms(steered_events, decisions, write,
     listed = json.loads(outs["json"].read_text())
     arrays = np.load(outs["npz"])
     assert arrays["steps"].tolist() == [-1, 0, 1, 2]
+    decisions = [event for event in steered_events if isinstance(event, Decided)]
     for row, same, event in zip(rows, listed, decisions, strict=True):
         made, chosen = event.decision, event.decision.chosen
         assert (int(row["step"]), row["policy"], row["stop"]) == (event.step, "dice", made.stop)
@@ -235,39 +168,81 @@ def test_decisions_are_exported_in_three_forms(steered_events, decisions, write,
         assert same_bits(arrays[f"step_{event.step}/poses"], event.problem.belief.object_from_world)
 
 
-def recovered(path: Path, data: bytes) -> tuple[list[Event], dict[str, str]]:
-    """Events that a damaged file gives, and what is lost."""
-    out = path.with_name("recovered.mcap")
-    path.write_bytes(data)
-    found = recover(path, out)
-    return list(read_recording(out).events()), found.lost
+def test_others_decide_on_the_recorded_problem(path):
+    recording, others = read_recording(path), ("voxel_entropy", "nearest_mean", "grid")
+    choices = chosen(recording, POLICY, [*others, "stop.spread=0.0", "stop.gain=0.0"])
+    recorded, *rows = policy_decisions(recording, choices, [1])
+    assert recorded["label"] == "recorded: information"
+    assert recorded["chosen"] == recording.decision(1).decision.chosen
+    for name, row in zip(others, rows, strict=True):
+        policy = build_policy(name, {"stop": STEERED["stop"]})
+        expected = policy.decide(recording.decision(1).problem)
+        action = expected.chosen
+        assert (row["label"], row["chosen"]) == (name, action)
+        assert row["score"] == expected.score[action]
+        assert row["blocked_chance"] == expected.blocked_chance[action]
+        assert row["as_recorded"] is (action == recorded["chosen"])
 
 
-def test_a_decision_behind_a_lost_probe_is_not_believed(steered_events, tmp_path):
-    path = tmp_path / "damaged.mcap"
-    data = bytearray(flushed(path, steered_events))
-    start, end = chunks_of(bytes(data), "/probe")[1]
-    data[start + 40 : end - 40] = bytes(end - start - 80)
-    events, lost = recovered(path, bytes(data))
-    assert [event.step for event in events if isinstance(event, Decided)] == [-1, 0]
-    assert {"/decision of step 1", "/decision of step 2"} <= set(lost)
+def test_start_and_direction_are_the_hands_place_and_its_z_axis(steered):
+    """Seen with hands that are turned about an axis of no symmetry."""
+    turn = axis_angle(np.array([0.36, 0.48, 0.8]), np.array(2.1))
+    of_first = decided(steered, -1)
+    old = of_first.problem.actions
+    turned = Actions(compose(turn, [0.0, 0.1, 0.2]) @ old.world_from_hand, old.length)
+    problem = dataclasses.replace(of_first.problem, actions=turned)
+
+    class Recorded:
+        start = steered[0]
+
+        def decision(self, _: int) -> Decided:
+            return dataclasses.replace(of_first, problem=problem)
+
+    (row,) = policy_decisions(Recorded(), [], [-1])
+    pose = turned.world_from_hand[of_first.decision.chosen]
+    forward, place = pose @ [0.0, 0.0, 1.0, 0.0], pose @ [0.0, 0.0, 0.0, 1.0]
+    assert [row[name] for name in ("dx", "dy", "dz")] == pytest.approx(forward[:3], abs=1e-15)
+    assert [row[name] for name in ("x_m", "y_m", "z_m")] == pytest.approx(place[:3], abs=1e-15)
 
 
-def test_viewers_get_an_arrow_from_start_to_end(decisions):
-    first, last = decisions[0], decisions[-1]
-    (entity,) = SceneUpdate.FromString(next_probe(first, 5)).entities
-    (arrow,) = entity.arrows
-    pose = first.problem.actions.world_from_hand[first.decision.chosen]
-    position: Any = arrow.pose.position
-    assert np.allclose([position.x, position.y, position.z], pose[:3, 3])
-    q = arrow.pose.orientation
-    along = [
-        1.0 - 2.0 * (q.y**2 + q.z**2),
-        2.0 * (q.x * q.y + q.w * q.z),
-        2.0 * (q.x * q.z - q.w * q.y),
-    ]
-    assert np.allclose(along, pose[:3, 2])
-    length = first.problem.actions.length[first.decision.chosen]
-    assert np.isclose(arrow.shaft_length + arrow.head_length, length)
-    (entity,) = SceneUpdate.FromString(next_probe(last, 5)).entities
-    assert len(entity.arrows) == 0
+def test_step_shows_a_row_for_each_policy(path, capsys):
+    words = ["--policy", "information", "policy.noise=0.5", "--policy", "information"]
+    assert main(["step", str(path), "--step", "1", *words]) == 0
+    shown = capsys.readouterr().out
+    rows = [line.split() for line in shown.splitlines() if re.match(r" *1 ", line)]
+    assert [row[1] for row in rows] == ["information", "information", "information#2"]
+    assert rows[0][2:] == rows[2][2:] != rows[1][2:]
+    assert "information with policy.noise=0.5" in shown
+
+
+def test_compare_counts_agreement_and_writes_a_table(path, tmp_path, capsys):
+    out = tmp_path / "decisions.csv"
+    words = ["--policies", "information", "grid", "--save-csv", str(out)]
+    assert main(["compare", str(path), *words]) == 0
+    assert re.search(r"^information +4 +4 of 4 +1 ", capsys.readouterr().out, re.M)
+    rows = list(csv.DictReader(out.open(newline="")))
+    assert len(rows) == 3 * 4
+    recording = read_recording(path)
+    for row in rows[::3]:
+        decision = recording.decision(int(row["step"])).decision
+        assert (int(row["chosen"]), row["stop"]) == (decision.chosen, decision.stop)
+        if decision.chosen >= 0:
+            expected = float(decision.expected_spread[decision.chosen])
+            assert float(row["expected_spread_m"]) == expected
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["step", "--step", "1", "--policy", "dice"], "policy is 'dice'; accepted: grid, "),
+        (["step", "--step", "1", "--policy", "noise=1"], "--policy noise=1 names none; accepted:"),
+        (["step", "--step", "1", "--policy", "grid", "--method", "icp"], "registers nothing"),
+        (["compare", "--policies", "grid", "nois=1"], "policy.nois does not exist; did you mean"),
+        (["compare", "--policies", "grid", "--save-plot", "a.png"], "--policies writes tables"),
+    ],
+)
+def test_what_cannot_be_is_one_line(path, words, message, capsys):
+    assert main([words[0], str(path), *words[1:]]) == 2
+    shown = capsys.readouterr().err
+    assert message in shown
+    assert shown.count("\n") == 1

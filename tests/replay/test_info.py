@@ -6,21 +6,11 @@ import json
 
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from replay.__main__ import main
 from replay.events import HypothesesFound, ProblemPosed
 from replay.verbs.info import is_other_programs, log_info, recording_info
 from tests.runners.sensors.small_logs import BEGIN, SECOND, ros2_sent, write_ros2
-
-
-def strict_json(text: str):
-    """The values of standard JSON."""
-
-    def refuse(name: str):
-        raise AssertionError(f"{name} is no JSON")
-
-    return json.loads(text, parse_constant=refuse)
 
 
 def test_info_tells_what_the_session_was(events, write):
@@ -43,24 +33,18 @@ def test_messages_are_counted_with_their_bytes(any_events, write):
     path = write(any_events)
     info = recording_info(path)
     with path.open("rb") as file:
-        stored = [
-            (channel.topic, len(m.data)) for _, channel, m in make_reader(file).iter_messages()
-        ]
+        stored = [(c.topic, len(m.data)) for _, c, m in make_reader(file).iter_messages()]
     assert sum(info["message_bytes"].values()) == sum(size for _, size in stored)
-    assert info["messages"] == {
-        topic: sum(topic == name for name, _ in stored) for topic in {name for name, _ in stored}
-    }
+    topics = [topic for topic, _ in stored]
+    assert info["messages"] == {topic: topics.count(topic) for topic in topics}
 
 
-def test_what_is_whole_of_an_unfinished_file_is_told(events, write, capsys):
+def test_what_is_not_whole_is_told(events, write, capsys):
     path = write(events)
     path.write_bytes(path.read_bytes()[:-1])
     assert main(["info", str(path)]) == 1
     shown = " ".join(capsys.readouterr().out.split())
     assert "unfinished; what is whole was read, and `python -m replay recover" in shown
-
-
-def test_a_problem_that_contradicts_the_points_is_found_by_checking(events, write, capsys):
     posed = next(event for event in events if isinstance(event, ProblemPosed))
     vars(posed.problem)["digest"] = "0" * 32
     assert main(["info", str(write(events))]) == 1
@@ -77,12 +61,12 @@ def test_a_problem_without_a_result_counts_as_no_registration(events, write, cap
 def test_json_is_standard_and_a_list_of_several(events, write, tmp_path, capsys):
     path, log, other = write(events), tmp_path / "log.mcap", tmp_path / "other.mcap"
     assert main(["info", str(path), "--json"]) == 0
-    assert strict_json(capsys.readouterr().out)["steps"][0]["best_cost"] is None
+    assert json.loads(capsys.readouterr().out)["steps"][0]["best_cost"] is None
     write_ros2(log, ros2_sent())
     other.write_bytes(b"no recording")
     assert main(["info", str(path), str(log), str(other), "--json"]) == 2
     shown = capsys.readouterr()
-    recording, of_log, failed = strict_json(shown.out)
+    recording, of_log, failed = json.loads(shown.out)
     assert recording["message_bytes"]["/probe"] > 0
     assert {topic["topic"] for topic in of_log["topics"]} >= {"/tf", "/depth"}
     assert "is not an MCAP file; accepted: " in failed["error"]
@@ -92,7 +76,7 @@ def test_json_is_standard_and_a_list_of_several(events, write, tmp_path, capsys)
 
 def test_topics_types_counts_and_rates_of_a_log(tmp_path, capsys):
     path = tmp_path / "log.mcap"
-    write_ros2(path, ros2_sent(9))
+    whole = write_ros2(path, ros2_sent(9), chunk_size=1500)
     assert is_other_programs(path)
     info = log_info(path)
     assert len(info["topics"]) == 15
@@ -105,13 +89,6 @@ def test_topics_types_counts_and_rates_of_a_log(tmp_path, capsys):
         "count": 9,
         "rate": pytest.approx(9.0 / 8.0),
     }
-    assert main(["info", str(path)]) == 0
-    assert "135 on 15 topics" in capsys.readouterr().out
-
-
-def test_unfinished_logs_are_counted_as_far_as_they_go(tmp_path, capsys):
-    path = tmp_path / "log.mcap"
-    whole = write_ros2(path, ros2_sent(9), chunk_size=1500)
     path.write_bytes(whole[: len(whole) // 3])
     assert 0 < sum(topic["count"] for topic in log_info(path)["topics"]) < 9 * 15
     assert main(["info", str(path)]) == 1
@@ -119,34 +96,10 @@ def test_unfinished_logs_are_counted_as_far_as_they_go(tmp_path, capsys):
     assert "unfinished or damaged: log.mcap: a record is cut short; what is whole" in output
 
 
-def test_a_log_written_without_an_index_is_whole(tmp_path):
-    path = tmp_path / "log.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, use_chunking=False, use_statistics=False, repeat_channels=False)
-        writer.start()
-        schema = writer.register_schema("x", "jsonschema", b"{}")
-        channel = writer.register_channel("/x", "json", schema)
-        for n in range(5):
-            writer.add_message(channel, n * SECOND // 10, b"{}", 0)
-        writer.finish()
-    info = log_info(path)
-    assert info["integrity"]["whole"]
-    assert [(topic["topic"], topic["count"]) for topic in info["topics"]] == [("/x", 5)]
-    assert (info["begin"], info["end"]) == (0, 4 * SECOND // 10)
-
-
-def test_a_log_without_messages_has_no_times(tmp_path, capsys):
-    path = tmp_path / "log.mcap"
-    write_ros2(path, [])
-    assert main(["info", str(path)]) == 0
-    assert "1970" not in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("name", "data", "message"),
     [
         ("none.mcap", None, "does not exist; accepted: "),
-        ("x.mcap", b"text", "is not an MCAP file; accepted: "),
         ("x.mcap", b"\x89MCAP0\r\n\x01", "has no session in it"),
         ("x.bag", b"#ROSBAG V2.0\n", "`rosbags-convert --src LOG.bag"),
     ],

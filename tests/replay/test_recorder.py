@@ -1,20 +1,36 @@
-"""Recorders behind one list: order, the same files, errors that reach the caller."""
+"""Recorders behind one list: order, errors that reach the caller, and what is on the disk when."""
 
 from __future__ import annotations
 
+import errno
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
 import threading
+import time
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import pytest
+from rerun.chunk import RrdReader
 
 from chsel.errors import RecordingError
+from chsel.problem import online_registration as online
+from replay.__main__ import main
 from replay.events import Measured
+from replay.files import WritingError, new_file, whole_file
 from replay.mcap.reader import read_recording
+from replay.mcap.writer import McapRecorder
 from replay.recorder import Recorders
+from tests.tools.kill_sessions import PROBES, points_session, reported_probes
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+STORED = REPOSITORY / "tests" / "replays" / "spam_can_icp.mcap"
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
 
 
 class Gate:
@@ -92,33 +108,26 @@ def test_what_follows_an_event_that_fails_is_dropped(end):
     assert other.calls == ["good", *(["close"] if end == "close" else [])]
 
 
-def test_an_error_of_pictures_reaches_the_caller_and_files_are_closed():
+@pytest.mark.parametrize("optional", ["", "it can be made anew"])
+def test_an_error_of_pictures_is_raised_or_a_warning_and_files_are_closed(optional, recwarn):
     file, pictures = Gate(), Gate("bad", is_open=False)
-    recorder = Recorders([file], pictures)
+    recorder = Recorders([file], pictures, optional=optional)
     for event in ("good", "bad", "dropped"):
         recorder.record(event)
     recorder.flush()
     pictures.gate.set()
-    with pytest.raises(RecordingError, match="no bad"):
+    if optional:
         recorder.close()
+        assert [str(warning.message) for warning in recwarn] == [f"no bad; {optional}"]
+    else:
+        with pytest.raises(RecordingError, match="no bad"):
+            recorder.close()
     assert pictures.calls == ["good", "bad"]
     assert file.calls == ["good", "bad", "dropped", "flush", "close"]
 
 
-def test_pictures_that_are_optional_end_with_a_warning(recwarn):
-    file, pictures = Gate(), Gate("bad")
-    recorder = Recorders([file], pictures, optional="it can be made anew")
-    for event in ("good", "bad", "dropped"):
-        recorder.record(event)
-    recorder.flush()
-    recorder.close()
-    assert pictures.calls == ["good", "bad"]
-    assert file.calls[-1] == "close"
-    assert [str(warning.message) for warning in recwarn] == ["no bad; it can be made anew"]
-
-
 _SCRIPT = """
-import runpy, sys
+import os, runpy, signal, sys
 from replay.events import Recorder
 from replay.recorder import Recorders
 from replay.mcap.writer import McapRecorder
@@ -129,18 +138,140 @@ for event in events:
     if type(event).__name__ == "Measured":
         recorder.flush()
         break
+os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-def run_script(end: str, path: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", _SCRIPT + end, str(Path(__file__).with_name("conftest.py"))]
-    return subprocess.run([*command, str(path)], capture_output=True, text=True, check=False)
-
-
-@pytest.mark.skipif(os.name == "nt", reason="there is no SIGKILL on Windows")
 def test_all_that_was_flushed_survives_sigkill(tmp_path, events, assert_same):
     path = tmp_path / "killed.mcap"
-    done = run_script("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", path)
+    conftest = str(Path(__file__).with_name("conftest.py"))
+    command = [sys.executable, "-c", _SCRIPT, conftest, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == -signal.SIGKILL, done.stderr
+    with pytest.raises(RecordingError, match="is unfinished"):
+        read_recording(path)
+    recording = read_recording(path, partial=True)
+    assert recording.damage == "unfinished"
     last = next(i for i, event in enumerate(events) if isinstance(event, Measured))
-    assert_same(read_recording(path, partial=True).events(), events[: last + 1])
+    assert_same(recording.events(), events[: last + 1])
+
+
+@dataclass
+class Synced:
+    """What was synced to the disk: of files the size then, by inode; of folders the names then."""
+
+    sizes: dict[int, int] = field(default_factory=dict)
+    names: dict[int, list[str]] = field(default_factory=dict)
+
+    def holds(self, path: Path) -> bool:
+        """Whether a file as it is now, and then its name, are on the disk."""
+        there = path.stat()
+        named = path.name in self.names.get(path.parent.stat().st_ino, [])
+        return named and self.sizes.get(there.st_ino) == there.st_size
+
+
+@pytest.fixture
+def synced(monkeypatch):
+    """Follows os.fsync."""
+    found = Synced()
+
+    def fsync(number: int) -> None:
+        there = os.fstat(number)
+        if os.path.isdir(f"/proc/self/fd/{number}"):
+            found.names[there.st_ino] = os.listdir(number)
+        else:
+            found.sizes[there.st_ino] = there.st_size
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    return found
+
+
+def test_a_recording_is_on_the_disk_when_it_is_closed(events, tmp_path, synced):
+    path = tmp_path / "recording.mcap"
+    recorder = McapRecorder(path)
+    for event in events:
+        recorder.record(event)
+    recorder.flush()
+    assert not synced.holds(path)  # a step waits for no disk
+    recorder.close()
+    assert synced.holds(path)
+
+
+def test_an_accepted_recording_is_on_the_disk(tmp_path, synced, monkeypatch):
+    drawn = online.normals
+    monkeypatch.setattr(online, "normals", lambda stream, shape: -drawn(stream, shape))
+    accepted = Path(shutil.copy(STORED, tmp_path / "accepted.mcap"))
+    before = accepted.stat().st_ino
+    assert main(["accept", str(accepted), "--yes"]) == 0
+    assert accepted.stat().st_ino != before
+    assert synced.holds(accepted)
+
+
+@pytest.mark.parametrize("make", [whole_file, new_file])
+def test_new_files_are_on_the_disk_and_a_full_one_is_named(make, tmp_path, synced):
+    path, full = tmp_path / "out.txt", tmp_path / "full.txt"
+    with make(path) as beside:
+        beside.write_text("text")
+    assert synced.holds(path)
+    with (
+        pytest.raises((RecordingError, WritingError), match=r"full\.txt cannot be written.*space"),
+        make(full),
+    ):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert sorted(os.listdir(tmp_path)) == ["out.txt"]
+
+
+def test_a_link_to_nothing_is_not_written_over(tmp_path):
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(RecordingError, match="link exists"), new_file(tmp_path / "link"):
+        pass
+
+
+@pytest.mark.slow
+def test_every_reported_probe_survives_kills_at_random_moments():
+    """In a process of its own: a fork needs one without the threads of other tests."""
+    command = [sys.executable, "-m", "tests.tools.kill_sessions", "--count", "30", "--seed", "1"]
+    process = subprocess.run(
+        command, capture_output=True, text=True, env=ENVIRONMENT, cwd=REPOSITORY, timeout=300
+    )
+    assert process.returncode == 0, process.stderr
+    figures = re.match(
+        r"(\d+) kills, (\d+) before .*, (\d+) after .*; (\d+) probes reported, (\d+) recovered",
+        process.stdout,
+    )
+    assert figures is not None, process.stdout
+    kills, without, ended, reported, recovered = map(int, figures.groups())
+    assert kills == 30
+    assert without + ended < 0.7 * kills  # most kills came in between
+    assert kills < reported <= recovered
+
+
+@pytest.mark.slow
+def test_a_killed_command_leaves_both_files_readable(tmp_path, capsys):
+    command = [sys.executable, "-u", "-m", "runners.probe", *points_session(tmp_path)]
+    command += ["method=chsel", "method.descent.restarts=2", "method.descent.iterations=20"]
+    command += [f"logs={tmp_path}", "recording=both"]
+    command += ["method.emitter.iterations=2000"]  # so that the kill is not too late
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT)
+    assert process.stdout is not None
+    output = ""
+    for line in process.stdout:
+        output += line
+        if reported_probes(output) == 3:
+            time.sleep(np.random.default_rng(3).uniform(0.0, 0.05))
+            process.send_signal(signal.SIGKILL)
+            break
+    output += process.stdout.read()
+    assert process.wait(timeout=60) == -signal.SIGKILL
+    reported = reported_probes(output)
+    assert 3 <= reported <= PROBES
+    (path,) = tmp_path.rglob("recording.mcap")
+    assert main(["recover", str(path), "-o", str(tmp_path / "recovered.mcap")]) == 0
+    recovered = read_recording(tmp_path / "recovered.mcap")
+    assert f"kept: {len(recovered.probes)} probes" in capsys.readouterr().out
+    assert [probe.step for probe in recovered.probes][:reported] == list(range(reported))
+    for step in range(reported):
+        assert recovered.problem(step).points.count > 0
+        assert recovered.hypotheses(step).object_from_world.shape == (30, 4, 4)
+    chunks = RrdReader(path.with_suffix(".rrd")).stream().to_chunks()
+    assert any("hypotheses" in chunk.entity_path for chunk in chunks)

@@ -12,15 +12,10 @@ from replay.__main__ import main
 from replay.comparing.choices import METHOD, chosen
 from replay.comparing.verification import EQUAL, verify
 from replay.environment import environment
-from replay.events import Event, HypothesesFound, SessionEnded
+from replay.events import HypothesesFound, SessionEnded
 from replay.files import file_digest
-from replay.mcap.reader import Recording, read_recording
+from replay.mcap.reader import read_recording
 from tests.tools.small_recordings import registered_session, write_recording
-
-
-def written(events: list[Event], path: Path) -> Recording:
-    write_recording(path, events)
-    return read_recording(path)
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +25,8 @@ def session():
 
 @pytest.fixture
 def recording(session, tmp_path):
-    return written(session, tmp_path / "session.mcap")
+    write_recording(tmp_path / "session.mcap", session)
+    return read_recording(tmp_path / "session.mcap")
 
 
 @pytest.fixture
@@ -42,21 +38,17 @@ def step(recording, tmp_path, monkeypatch):
     return lambda *words: main(["step", str(recording.path), *words])
 
 
-def test_the_recorded_method_gives_the_recorded_bits(recording, step, capsys):
+def test_the_recorded_method_gives_the_recorded_bits_and_says_where_they_are_from(
+    recording, step, capsys
+):
     assert step("--step", "1") == 0
     said = " ".join(capsys.readouterr().out.split())
-    expected = recording.hypotheses(1)
     assert "its 1 results are those recorded, to the bit" in said
     again = read_recording("session_step1_chsel.mcap")
-    assert again.hypotheses(1).digest == expected.digest
+    assert again.hypotheses(1).digest == recording.hypotheses(1).digest
     digests = [[a.digest for a in of.snapshots(1)] for of in (recording, again)]
     assert digests[0] == digests[1]
     assert len(digests[0]) > 2
-
-
-def test_the_new_recording_holds_the_problem_and_says_where_it_is_from(recording, step):
-    assert step("--step", "1", "-o", "again.mcap") == 0
-    again = read_recording("again.mcap")
     assert again.steps == (1,)
     assert again.problem(1).digest == recording.problem(1).digest
     assert [probe.step for probe in again.probes] == [0, 1]
@@ -76,42 +68,26 @@ def test_the_new_recording_holds_the_problem_and_says_where_it_is_from(recording
 
 
 def test_another_method_with_other_settings_is_recorded_as_such(recording, step, capsys):
-    words = ("gradient_descent", "cost.free_scale=40", "preset=paper")
+    words = ("gradient_descent@paper", "cost.free_scale=40")
     assert step("--step", "1", "--method", *words) == 0
     assert "gradient_descent@paper with cost.free_scale=40" in capsys.readouterr().out
     again = read_recording("session_step1_gradient_descent.mcap")
-    assert again.start.method == "gradient_descent"
-    assert again.start.config["method"]["name"] == "gradient_descent"
-    assert again.start.config["method"]["cost"]["free_scale"] == 40
-    assert again.start.config["method"]["descent"]["stop_below"] is None
-    assert again.start.config["preset"] == {"name": "paper"}
+    config = again.start.config
+    assert again.start.method == config["method"]["name"] == "gradient_descent"
+    assert config["method"]["cost"]["free_scale"] == 40
+    assert config["method"]["descent"]["stop_below"] is None
+    assert config["preset"] == {"name": "paper"}
     assert again.problem(1).digest == recording.problem(1).digest
-    assert again.hypotheses(1).digest != recording.hypotheses(1).digest
     (choice,) = chosen(recording, METHOD, ["gradient_descent@paper", "cost.free_scale=40"])
     expected = choice.build().register(recording.problem(1))
-    assert again.hypotheses(1).digest == expected.digest
-    assert [verdict.outcome for verdict in verify(again)] == [EQUAL]
+    assert again.hypotheses(1).digest == expected.digest != recording.hypotheses(1).digest
 
 
-def test_a_problem_without_a_result_can_be_registered(session, tmp_path, capsys):
-    events = [e for e in session if not (isinstance(e, HypothesesFound) and e.step == 1)]
-    path = written(events, tmp_path / "lacking.mcap").path
+def test_a_problem_without_a_result_can_be_registered(session, write, tmp_path, capsys):
+    path = write([e for e in session if not (isinstance(e, HypothesesFound) and e.step == 1)])
     assert main(["step", str(path), "--step", "1", "-o", str(tmp_path / "a.mcap")]) == 0
     assert "no result was recorded" in capsys.readouterr().out
-    again = read_recording(tmp_path / "a.mcap")
-    assert again.start.config["source"]["hypotheses"] is None
-
-
-def test_nothing_is_overwritten(recording, step, capsys):
-    Path("mine.mcap").write_bytes(b"mine")
-    assert step("--step", "1", "-o", "mine.mcap") == 2
-    assert Path("mine.mcap").read_bytes() == b"mine"
-    before = recording.path.read_bytes()
-    assert step("--step", "1", "-o", str(recording.path)) == 2
-    assert recording.path.read_bytes() == before
-    assert step("--step", "1", "--save-rerun", "mine.mcap") == 2
-    assert capsys.readouterr().err.count("exists") == 3
-    assert [file.name for file in Path().iterdir()] == ["mine.mcap"]
+    assert read_recording(tmp_path / "a.mcap").start.config["source"]["hypotheses"] is None
 
 
 @pytest.mark.parametrize(
@@ -119,8 +95,6 @@ def test_nothing_is_overwritten(recording, step, capsys):
     [
         (("--step", "2"), "there is no step 2; accepted: 0, 1"),
         (("--step", "1", "--method", "a", "b"), "--method names a and b; accepted: one, then"),
-        (("--step", "1", "--method", "chselle"), "chselle"),
-        (("--step", "1", "--method", "emitter.iteration=4"), "iteration does not exist"),
     ],
 )
 def test_what_does_not_exist_is_named(step, capsys, words, message):

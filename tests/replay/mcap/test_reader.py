@@ -18,15 +18,15 @@ from replay.events import ProblemPosed
 from replay.mcap.encoding import decode, encode, message_class
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import FORMAT_VERSION, RECORDS
+from tests.replay.conftest import nth
 
 Change = Callable[[str, bytes], bytes | None]
 
 
-def rewritten(path: Path, change: Change, *, topics: tuple[str, ...] = ()) -> Path:
+def rewritten(path: Path, change: Change) -> Path:
     """A whole, checksummed copy of a recording with other messages or attachments.
 
-    `change` gets topic or attachment name and the bytes, and gives new bytes or None to leave out.
-    Topics in `topics` are left out altogether.
+    change: gets topic or attachment name and the bytes; gives new bytes, or None to leave out.
     """
     copy = path.with_suffix(".changed.mcap")
     with path.open("rb") as source, copy.open("wb") as target:
@@ -41,13 +41,12 @@ def rewritten(path: Path, change: Change, *, topics: tuple[str, ...] = ()) -> Pa
             writer.register_schema(schema.name, schema.encoding, schema.data)
         channels = {}
         for channel in summary.channels.values():
-            if channel.topic not in topics:
-                number = writer.register_channel(channel.topic, "protobuf", channel.schema_id)
-                channels[channel.topic] = number
+            number = writer.register_channel(channel.topic, "protobuf", channel.schema_id)
+            channels[channel.topic] = number
         sequence = 0
         for _, channel, message in reader.iter_messages():
             data = change(channel.topic, message.data)
-            if data is not None and channel.topic in channels:
+            if data is not None:
                 time = message.log_time
                 writer.add_message(channels[channel.topic], time, data, time, sequence)
                 sequence += 1
@@ -83,11 +82,6 @@ def test_problems_are_rebuilt_from_the_file_alone(events, write):
         assert problem.low_cost_set.tobytes() == posed[step].low_cost_set.tobytes()
         assert problem.key == posed[step].key
     assert len(recording.problem(2).low_cost_set) == 12
-
-
-def test_steps_without_a_registration_are_named(events, write):
-    path = write(events)
-    recording = read_recording(path)
     with pytest.raises(RecordingError, match="no registration problem of step 0; accepted: 1, 2"):
         recording.problem(0)
     with pytest.raises(RecordingError, match="no result of step 7; accepted: 1, 2"):
@@ -102,12 +96,9 @@ def test_plain_mcap_and_protobuf_rebuild_a_problem(events, write):
         attachments = {item.name: item.data for item in reader.iter_attachments()}
         stored = [(c.topic, s.name, m) for s, c, m in reader.iter_messages()]
     pool = descriptor_pool.DescriptorPool()
-    added = set()
     for schema in summary.schemas.values():
         for proto in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
-            if proto.name not in added:
-                pool.Add(proto)
-                added.add(proto.name)
+            pool.Add(proto)
 
     def parsed(name, data):
         return message_factory.GetMessageClass(pool.FindMessageTypeByName(name)).FromString(data)
@@ -125,12 +116,10 @@ def test_plain_mcap_and_protobuf_rebuild_a_problem(events, write):
         if topic == "/hypotheses":
             elites = array(content.elites)
         if topic == "/problem" and content.step == 2:
-            low_cost_set = (
-                array(content.low_cost_set) if content.HasField("low_cost_set") else elites
-            )
             break
+    low_cost_set = array(content.low_cost_set) if content.HasField("low_cost_set") else elites
     grid = parsed("chsel.SdfGrid", attachments["sdf_grid"])
-    expected = next(e.problem for e in events if isinstance(e, ProblemPosed) and e.step == 2)
+    expected = nth(events, ProblemPosed, 1).problem
     known = np.concatenate(points["known"])
     for found, wanted in (
         (np.concatenate(points["free"]), expected.points.free),
@@ -155,21 +144,6 @@ def test_plain_mcap_and_protobuf_rebuild_a_problem(events, write):
     assert mesh.faces.tolist() == events[0].mesh.faces.tolist()
 
 
-def test_a_flipped_bit_in_a_chunk_is_named_and_what_is_before_it_kept(events, write, assert_same):
-    path = write(events)
-    whole = bytearray(path.read_bytes())
-    with path.open("rb") as file:
-        chunks = make_reader(file).get_summary().chunk_indexes
-    assert len(chunks) == 2
-    whole[chunks[1].chunk_start_offset + chunks[1].chunk_length // 2] ^= 4
-    path.write_bytes(whole)
-    with pytest.raises(RecordingError, match=r"is damaged after byte \d+: "):
-        read_recording(path)
-    recording = read_recording(path, partial=True)
-    assert recording.damage.startswith("damaged after byte")
-    assert_same(recording.events(), events[:1])
-
-
 def test_an_event_cut_from_its_points_is_left_out(events, write, assert_same):
     path = write(events[:3])
     seen = []
@@ -185,30 +159,20 @@ def test_an_event_cut_from_its_points_is_left_out(events, write, assert_same):
     assert_same(read_recording(cut, partial=True).events(), events[:2])
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
+def test_other_files_are_refused(tmp_path):
+    path, others = tmp_path / "recording.mcap", io.BytesIO()
+    writer = Writer(others)
+    writer.start("ros2", "")
+    writer.finish()
+    for content, message in (
         (b"", "is not an MCAP file; accepted: a recording.mcap that this project wrote"),
-        (b"ply\nformat ascii 1.0\n", "is not an MCAP file"),
         (MCAP0_MAGIC, "is unfinished"),
         (MCAP0_MAGIC * 2, "is damaged after byte"),
-    ],
-)
-def test_other_files_are_refused(tmp_path, content, message):
-    path = tmp_path / "recording.mcap"
-    path.write_bytes(content)
-    with pytest.raises(RecordingError, match=message):
-        read_recording(path)
-
-
-def test_recordings_of_other_programs_are_refused(tmp_path):
-    path = tmp_path / "other.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "")
-        writer.finish()
-    with pytest.raises(RecordingError, match="is another program's"):
-        read_recording(path)
+        (others.getvalue(), "is another program's"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(RecordingError, match=message):
+            read_recording(path)
 
 
 def drop(*names: str) -> Change:
@@ -228,18 +192,6 @@ def test_another_format_version_is_named_before_all_else(events, write):
         read_recording(rewritten(write(events), newer))
 
 
-@pytest.mark.parametrize("name", ["mesh.ply", "sdf_grid"])
-def test_a_changed_attachment_has_another_digest(events, write, name):
-    def nudged(found: str, data: bytes) -> bytes:
-        if found != name:
-            return data
-        position = data.index(b"end_header\n") + 11 if name == "mesh.ply" else len(data) - 8
-        return data[:position] + bytes([data[position] ^ 1]) + data[position + 1 :]
-
-    with pytest.raises(RecordingError, match=f"attachment {name} has digest .* not .* as recorded"):
-        read_recording(rewritten(write(events), nudged))
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -248,19 +200,11 @@ def test_a_changed_attachment_has_another_digest(events, write, name):
         (edited("/known_points", new_digest="0"), "new points of step -1 has digest"),
         (edited("/known_points", occupied=9), "occupied points of step -1 are missing"),
         (edited("/session", config="[1]"), "its configuration is not a mapping"),
-        (edited("/session", config="{"), "Expecting property name"),
         (edited("/session", workspace=np.ones((2, 3))), "every lower bound below"),
-        (edited("/session", object="\x1b[2J"), r"object holds the character '\\x1b' at 0"),
-        (edited("/session", free_resolution=1e-12), "free_resolution is 1e-12; accepted"),
         (edited("/session", world_from_object=np.eye(4) * 3.0), "is not a rigid transform"),
-        (edited("/probe", outcome="gone"), "accepted: contact, free, points"),
         (edited("/probe", step=1), "has a time of step 0, not its own"),
-        (edited("/trace", lowest_cost=1e12), "accepted: lowest, median, highest"),
         (edited("/problem", sdf_digest="0"), "the SDF grid of the problem of step 1"),
-        (edited("/session_ended", outcome="fine"), "accepted: finished, interrupted, failed"),
         (drop("/points/occupied"), "occupied points of step 0 are missing"),
-        (drop("/probe"), "/points/free is out of place"),
-        (drop("/session", "/points/free", "/known_points"), "a message on /log is out of place"),
         (drop("/archive"), "the archive of step 1 is missing"),
         (drop("/hypotheses"), "the low-cost set of step 2 is missing"),
     ],
@@ -270,37 +214,22 @@ def test_content_that_contradicts_itself_is_refused(events, write, change, messa
         read_recording(rewritten(write(events), change))
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        edited("/problem", initial_set=np.eye(4)[None]),
-        edited("/problem", key_seed=1),
-        edited("/problem", free_resolution=0.03),
-        edited("/problem", low_cost_set=np.eye(4)[None]),
-        edited("/problem", workspace=np.array([[0.0] * 3, [1.0] * 3])),
-        edited("/problem", digest="0"),
-    ],
-)
-def test_a_problem_that_is_not_the_recorded_one_is_refused(events, write, change):
-    recording = read_recording(rewritten(write(events), change))
-    with pytest.raises(RecordingError, match="the problem of step 2 has digest"):
-        recording.problem(2)
-    with pytest.raises(RecordingError, match="the problem of step 1 has digest"):
-        list(recording.events())
+def test_a_problem_that_is_not_the_recorded_one_is_refused(events, write):
+    for change in (edited("/problem", initial_set=np.eye(4)[None]), edited("/problem", key_seed=1)):
+        recording = read_recording(rewritten(write(events), change))
+        with pytest.raises(RecordingError, match="the problem of step 2 has digest"):
+            recording.problem(2)
+        with pytest.raises(RecordingError, match="the problem of step 1 has digest"):
+            list(recording.events())
 
 
-def test_a_lost_message_is_noticed_though_all_checksums_hold(events, write):
-    """Measured values are in no digest; that they are all there follows from their numbering."""
+def test_messages_that_come_twice_are_noticed_by_their_numbers(events, write):
     path = write(events)
     whole = path.read_bytes()
     with path.open("rb") as file:
         chunk = make_reader(file).get_summary().chunk_indexes[1]
     start = chunk.chunk_start_offset
     end = start + chunk.chunk_length + chunk.message_index_length
-    path.write_bytes(whole[:start] + whole[end:])
-    with pytest.raises(RecordingError, match="damaged after byte"):
-        read_recording(path)
-    twice = path.with_name("twice.mcap")
-    twice.write_bytes(whole[:end] + whole[start:])
+    path.write_bytes(whole[:end] + whole[start:])
     with pytest.raises(RecordingError, match=r"message \d+ is missing, \d+ follows"):
-        read_recording(twice)
+        read_recording(path)

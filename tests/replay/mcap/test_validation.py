@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import struct
 from collections.abc import Callable
-from pathlib import Path
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-import zstandard
-from mcap.opcode import Opcode
-from mcap.reader import make_reader
 
 from chsel.cost.cost_settings import CostSettings, interior_points
-from chsel.errors import RecordingError, SdfError, SettingError
-from chsel.methods.chsel import ChselSettings
+from chsel.errors import RecordingError, SettingError
 from chsel.methods.gradient_descent import DescentSettings
-from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.points import KnownPoints
-from chsel.problem.registration_problem import RegistrationProblem
-from chsel.problem.sdf_grid import SdfGrid
-from chsel.qd.emitters import EmitterSettings
 from chsel.qd.selection import ArchiveSettings
 from replay.events import (
+    ActionsOffered,
+    Decided,
     Event,
     HypothesesFound,
     Logged,
@@ -37,37 +30,25 @@ from replay.events import (
     SessionEnded,
     SnapshotTaken,
     Timed,
-    Traced,
 )
 from replay.mcap.reader import read_recording
-from tests.replay.conftest import with_sensors
+from tests.replay.conftest import changed, example_events, nth, with_sensors
 
 Events = list[Event]
 Change = Callable[[Events], Events]
-Write = Callable[[Events], Path]
 
 
-def first(events: Events, kind: type) -> int:
-    return next(i for i, event in enumerate(events) if isinstance(event, kind))
-
-
-def changed(kind: type, /, **values: Any) -> Change:
+def first(kind: type, /, **values: Any) -> Change:
     """Other values of the first event of a kind."""
-
-    def change(events: Events) -> Events:
-        i = first(events, kind)
-        return [*events[:i], dataclasses.replace(events[i], **values), *events[i + 1 :]]
-
-    return change
+    return lambda events: changed(events, nth(events, kind), **values)
 
 
 def result(make: Callable[[Any], dict[str, Any]]) -> Change:
     """Other values of the first result, made of the old ones."""
 
     def change(events: Events) -> Events:
-        found: Any = events[first(events, HypothesesFound)]
-        other = dataclasses.replace(found.hypotheses, **make(found.hypotheses))
-        return changed(HypothesesFound, hypotheses=other)(events)
+        old = nth(events, HypothesesFound).hypotheses
+        return first(HypothesesFound, hypotheses=dataclasses.replace(old, **make(old)))(events)
 
     return change
 
@@ -81,14 +62,18 @@ def inserted(place: int, event: Event) -> Change:
     return lambda events: [*events[:place], event, *events[place:]]
 
 
+def before(kind: type, event: Event) -> Change:
+    return lambda events: inserted(events.index(nth(events, kind)), event)(events)
+
+
 def repeated(kind: type) -> Change:
-    return lambda events: inserted(first(events, kind), events[first(events, kind)])(events)
+    return lambda events: before(kind, nth(events, kind))(events)
 
 
-def moved(kind: type, before: type) -> Change:
+def moved(kind: type, behind: type) -> Change:
     def change(events: Events) -> Events:
-        event = events.pop(first(events, kind))
-        return inserted(first(events, before), event)(events)
+        event = nth(events, kind)
+        return before(behind, event)([other for other in events if other is not event])
 
     return change
 
@@ -97,18 +82,9 @@ def without(kind: type) -> Change:
     return lambda events: [event for event in events if not isinstance(event, kind)]
 
 
-def image(height: int, width: int) -> dict[str, Any]:
-    return {"values": np.zeros((height, width), np.uint16), "mask": np.zeros((height, width), bool)}
-
-
-def hand(mesh: trimesh.Trimesh) -> Change:
-    return changed(RigDescribed, hand=mesh)
-
-
 WRONG: dict[str, Change] = {
     # results
     r"Hypotheses of step 1: cost is out of order": result(lambda e: {"cost": e.cost[::-1].copy()}),
-    "cost is out of order; accepted": result(lambda e: {"cost": np.nan * e.cost}),
     "cost is -inf": result(lambda e: {"cost": np.array([-np.inf, 1, 2, 3, 4.0])}),
     r"object_from_world\[0\] is not a rigid": result(
         lambda e: {"object_from_world": 1.5 * e.object_from_world}
@@ -122,59 +98,39 @@ WRONG: dict[str, Change] = {
     ),
     "cell is out of range; accepted: -1 to -1": result(lambda e: {"archive": None}),
     "has cells out of order": archive(cells=np.zeros(12, dtype=np.int64)),
-    "has 2 axes, but names": archive(measure_names=("x",)),
-    "has an empty range": archive(lower=np.array([-0.3, 0.3])),
+    "has 2 axes, but names": archive(measure_names=("x",), refinement=2),
     "objectives has a number that is not finite": archive(objectives=np.full(12, np.nan)),
-    r"cells, \(4294967295, 4294967295\)": archive(shape=(2**32 - 1,) * 2),
     # numbers and texts
     "seconds has a number that": inserted(5, Timed(0, {"a": np.inf})),
     r"a name of values holds the character '\\x1b'": inserted(5, Measured(0, {"\x1b": 1.0})),
     "a log line holds the character": inserted(5, Logged(0, "info", "\x00")),
-    # images
-    r"SensorImage of step 0: sensor is 'a/b'; accepted: letters, digits and _": changed(
+    # sensors
+    r"SensorImage of step 0: sensor is 'a/b'; accepted: letters, digits and _": first(
         SensorImage, sensor="a/b"
     ),
-    "sensor is ''": changed(SensorImage, sensor=""),
-    "kind is 'color'; accepted: depth, deformation": changed(SensorImage, kind="color"),
-    r"unit is nan; accepted: 1e-09 to 1000 \(m\)": changed(SensorImage, unit=np.nan),
-    r"unit is 0\.0": changed(SensorImage, unit=0.0),
-    "intrinsics .* above 0": changed(SensorImage, intrinsics=np.array([0.0, 1.0, 2.0, 3.0])),
-    r"intrinsics .* up to 1e\+06": changed(
-        SensorImage, intrinsics=np.array([1.0, 1.0, np.inf, 3.0])
+    "kind is 'color'; accepted: depth, deformation": first(SensorImage, kind="color"),
+    r"unit is nan; accepted: 1e-09 to 1000 \(m\)": first(SensorImage, unit=np.nan),
+    "intrinsics .* above 0": first(SensorImage, intrinsics=np.array([0.0, 1.0, 2.0, 3.0])),
+    "no triangle of its vertices": first(
+        RigDescribed, hand=trimesh.Trimesh(np.eye(3), [[0, 1, 3]], process=False)
     ),
-    r"world_from_camera\[0\] is not a rigid": changed(
-        SensorImage, world_from_camera=2.0 * np.eye(4)
-    ),
-    r"height is 0; accepted: 1 to 8192 \(pixels\)": changed(SensorImage, **image(0, 3)),
-    "height is 8193; accepted": changed(SensorImage, **image(8193, 1)),
-    # the rig
-    "the mesh has a vertex that is not finite": hand(
-        trimesh.Trimesh(np.full((3, 3), np.inf), [[0, 1, 2]], process=False)
-    ),
-    "no triangle of its vertices": hand(trimesh.Trimesh(np.eye(3), [[0, 1, 3]], process=False)),
-    "the mesh has no faces": hand(trimesh.Trimesh()),
     # order
     "probe 0 follows probe 0": inserted(8, Probe(0, "free", KnownPoints())),
     "step 1 has a second registration problem": repeated(ProblemPosed),
     "/hypotheses of step 1 is in no registration of it": repeated(HypothesesFound),
     "/archive of step 1 is in no registration": moved(HypothesesFound, SnapshotTaken),
-    "/trace of step 1 is in no registration of it": moved(Traced, ProblemPosed),
     "an event follows the end of the session": repeated(SessionEnded),
-    "step 0 follows one of step 1": lambda events: inserted(
-        first(events, ProblemPosed), Logged(0, "info", "")
-    )(events),
+    "step 0 follows one of step 1": before(ProblemPosed, Logged(0, "info", "")),
     "there is a rig of step -1; accepted: one, before all steps": repeated(RigDescribed),
-    "there is a rig of step 0": changed(RigDescribed, step=0),
     "an image of step 0 does not precede the probe of its": moved(SensorImage, SessionEnded),
-    "image of step -1 does not precede": changed(SensorImage, step=-1),
     "an image of step 0 has no rig before it": without(RigDescribed),
 }
 
 
 @pytest.fixture
-def robot(make_events):
+def robot():
     """A session of two probes, with sensors and a registration."""
-    return with_sensors(make_events(steps=2, free=3))
+    return with_sensors(example_events(steps=2, free=3))
 
 
 @pytest.mark.parametrize("message", WRONG)
@@ -194,18 +150,9 @@ def test_it_is_refused_by_writer_and_reader(robot, write, monkeypatch, message):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"values": np.zeros((2, 2))}, r"values of float64 \(2, 2\); accepted: uint16"),
-        ({"mask": np.zeros((5, 6), bool)}, r"mask of an image is bool \(5, 6\); accepted: bool"),
-        ({"mask": np.zeros((5, 7), np.uint8)}, "mask of an image is uint8"),
-        ({"values": np.zeros(4, np.uint16)}, r"values of uint16 \(4,\); accepted"),
-    ],
-)
-def test_pixels_of_another_kind_are_refused(robot, write, values, message):
-    with pytest.raises(RecordingError, match=message):
-        write(changed(SensorImage, **values)(robot))
+def test_pixels_of_another_kind_are_refused(robot, write):
+    with pytest.raises(RecordingError, match=r"mask of an image is bool \(5, 6\); accepted: bool"):
+        write(first(SensorImage, mask=np.zeros((5, 6), bool))(robot))
 
 
 def test_a_diverged_start_of_infinite_cost_is_a_result(robot, write, assert_same):
@@ -225,61 +172,92 @@ def test_a_configuration_that_is_not_plain_is_refused(events, write, value):
         write([start])
 
 
-Write = Callable[[list[Event]], Path]
+def test_rig_and_images_are_found_by_step(sensor_events, write, assert_same):
+    recording = read_recording(write(sensor_events))
+    assert recording.rig is not None
+    assert (recording.rig.name, recording.rig.source) == ("cabinet", "sha256:0a1b")
+    assert recording.image_steps == (0, 1, 2)
+    written = [event for event in sensor_events if isinstance(event, SensorImage)]
+    assert_same(recording.sensor_images([1]), [event for event in written if event.step == 1])
+    assert_same(recording.sensor_images(), written)
+    assert not any(isinstance(event, SensorImage) for event in recording.events(images=False))
+    with pytest.raises(RecordingError, match="no image of a sensor of step 7; accepted: 0, 1, 2"):
+        recording.sensor_images([7])
 
 
-@pytest.mark.parametrize("hidden", [False, True])
-def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is(events, write, hidden):
-    """hidden: only the compressed data say how much it is."""
-    path = write(events)
-    data = path.read_bytes()
-    packed, size = zstandard.compress(bytes(2**29 + 1)), 2**29 + 1
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    place = summary.chunk_indexes[1].chunk_start_offset
-    head = struct.pack("<QQQI", 0, 0, 5 if hidden else size, 0) + struct.pack("<I", 4) + b"zstd"
-    content = head + struct.pack("<Q", len(packed)) + packed
-    record = struct.pack("<BQ", Opcode.CHUNK, len(content)) + content
-    path.write_bytes(data[:place] + record + data[place:])
-    with pytest.raises(RecordingError, match=f"a chunk claims {size} bytes, unpacked"):
-        read_recording(path)
-    assert read_recording(path, partial=True).start.object == events[0].object
+def test_a_recording_gives_actions_and_decisions_back(steered_events, write, assert_same):
+    recording = read_recording(write(steered_events))
+    assert recording.decision_steps == (-1, 0, 1, 2)
+    written = [event for event in steered_events if isinstance(event, Decided | ActionsOffered)]
+    read = [recording.offered, *map(recording.decision, recording.decision_steps)]
+    assert_same(read, written)
+    with pytest.raises(RecordingError, match=r"no decision of step 3; accepted: -1, 0, 1, 2$"):
+        recording.decision(3)
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("values", "message"),
     [
-        (lambda: DescentSettings(restarts=1_000_001), "restarts is 1000001; accepted: at most"),
-        (
-            lambda: DescentSettings(restarts=10**5, iterations=11),
-            "restarts x iterations is 1100000",
-        ),
-        (lambda: EmitterSettings(iterations=10**7), "iterations is 10000000; accepted: at most"),
-        (lambda: ArchiveSettings(bins=4000), r"bins \*\* 2, the number of cells, is 16000000"),
-        (lambda: ArchiveSettings(measure="rotation_6", bins=15), r"bins \*\* 6"),
-        (lambda: OnlineSettings(hypotheses=10**7), "hypotheses is 10000000; accepted: at most"),
-        (lambda: ChselSettings(passes=10_001), "passes is 10001; accepted: at most 10_000"),
+        ({"chosen": 4}, "chosen is 4; accepted: -1 to 3"),
+        ({"chosen": 0}, "action 0 is chosen, which cannot be taken"),
+        ({"stop": "gain"}, "action 1 is chosen with the stop 'gain'"),
+        ({"chosen": -1}, "action -1 is chosen with the stop ''"),
+        ({"score": np.array([0.0, np.nan, 0.0, 0.0])}, "score has NaN or inf"),
+        ({"hit_chance": np.array([0.0, 1.1, 0.0, 0.0])}, "hit_chance has a number that is no"),
+        ({"expected_spread": np.full(4, np.inf)}, "expected_spread has a number that is not"),
+        ({"contacts": np.zeros((2, 3))}, "2 contacts for 3 poses; accepted: one for each, or none"),
+        ({"contacts": np.full((3, 3), np.inf)}, "a contact is not finite"),
     ],
 )
-def test_settings_have_upper_bounds(make, message):
-    with pytest.raises(SettingError, match=message):
-        make()
+def test_a_decision_that_makes_no_sense_is_not_written(steered_events, write, values, message):
+    old = nth(steered_events, Decided, 1)
+    other = dataclasses.replace(old.decision, **values)
+    with pytest.raises(RecordingError, match=message):
+        write(changed(steered_events, old, decision=other))
 
 
-def test_a_spacing_too_fine_for_the_grid_is_refused(events):
-    sdf: SdfGrid = events[0].sdf
+@pytest.mark.parametrize(
+    ("kind", "step", "message"),
+    [
+        (Measured, 1, None),
+        (Probe, 2, None),
+        (Probe, 1, "a decision of step 1 follows probe 0"),
+        (ProblemPosed, 1, "the registration of step 1 follows its decision"),
+        (Decided, 2, "a decision of step 1 follows probe 2|follows one of step 2"),
+    ],
+)
+def test_a_decision_stands_after_the_results_of_its_step(
+    steered_events, write, kind, step, message
+):
+    """With the decision after step 1 ahead of an event."""
+    one = nth(steered_events, Decided, 2)
+    rest = [event for event in steered_events if event is not one]
+    place = next(i for i, e in enumerate(rest) if isinstance(e, kind) and e.step == step)
+    with pytest.raises(RecordingError, match=message) if message else nullcontext():
+        write(inserted(place, one)(rest))
+
+
+def test_a_decision_is_of_the_actions_and_points_before_it(steered_events, write):
+    one, other = (nth(steered_events, Decided, number) for number in (0, 1))
+    for change, message in (
+        (without(ActionsOffered), "a decision of step -1 has no actions before it"),
+        (repeated(ActionsOffered), "accepted: once, before all steps"),
+        (
+            lambda events: changed(events, other, problem=one.problem),
+            "points, a grid, a workspace, actions or a hand that",
+        ),
+    ):
+        with pytest.raises(RecordingError, match=message):
+            write(change(steered_events))
+
+
+def test_settings_have_upper_bounds(events):
+    with pytest.raises(SettingError, match="restarts is 1000001; accepted: at most"):
+        DescentSettings(restarts=1_000_001)
+    with pytest.raises(SettingError, match="restarts x iterations is 1100000"):
+        DescentSettings(restarts=10**5, iterations=11)
+    with pytest.raises(SettingError, match=r"bins \*\* 6"):
+        ArchiveSettings(measure="rotation_6", bins=15)
+    fine = CostSettings(-0.01, free_term="interior", interior_spacing=1e-6)
     with pytest.raises(SettingError, match=r"interior_spacing 1e-06 m makes 3\.0e\+15 nodes"):
-        interior_points(sdf, CostSettings(-0.01, free_term="interior", interior_spacing=1e-6))
-
-
-def test_grids_whose_nodes_cannot_be_told_apart_are_refused(events):
-    sdf: SdfGrid = events[0].sdf
-    for resolution in (1e-320, 1e300):
-        with pytest.raises(SdfError, match=r"SDF resolution is .*accepted: 1e-06 to 1000"):
-            dataclasses.replace(sdf, resolution=resolution)
-    with pytest.raises(SdfError, match=r"SDF origin is .*; accepted: up to 1e"):
-        dataclasses.replace(sdf, origin=np.full(3, 1e308))
-    problem: RegistrationProblem = next(e.problem for e in events if isinstance(e, ProblemPosed))
-    with pytest.raises(SettingError, match="free_resolution is 1e-300; accepted"):
-        dataclasses.replace(problem, free_resolution=1e-300)
+        interior_points(events[0].sdf, fine)

@@ -10,16 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 
 import replay
 from chsel.problem.poses import inverse, rotation_matrices
-from replay.events import Event, HypothesesFound, Probe
+from replay.events import Decided, HypothesesFound, Probe
 from replay.mcap.foxglove_messages import FOXGLOVE, POINT_CLASSES, VIEWS
 from replay.mcap.schemas import MESSAGES, RECORDS, STEP_TIME
-from replay.mcap.viewer_messages import CumulativePoints, simple_mesh
+from replay.mcap.viewer_messages import CumulativePoints, next_probe, simple_mesh
+from tests.replay.conftest import example_events, nth
 
 LAYOUT = Path(replay.__file__).parent / "foxglove_layout.json"
 
@@ -28,10 +31,6 @@ def messages(path: Path, *topics: str) -> list[tuple[str, int, bytes]]:
     with path.open("rb") as file:
         found = make_reader(file, validate_crcs=True).iter_messages(topics or None)
         return [(channel.topic, message.log_time, message.data) for _, channel, message in found]
-
-
-def last_found(events: list[Event]) -> Any:
-    return [event.hypotheses for event in events if isinstance(event, HypothesesFound)][-1]
 
 
 def positions(cloud: bytes) -> np.ndarray:
@@ -55,7 +54,7 @@ def test_a_scene_holds_the_object_at_each_distinct_hypothesis(events, write):
     scene = SceneUpdate.FromString(data)
     assert scene.SerializeToString(deterministic=True) == data  # put together of bytes
     (entity,) = scene.entities
-    found = last_found(events)
+    found = nth(events, HypothesesFound, -1).hypotheses
     poses = inverse(found.object_from_world[~found.duplicate])
     assert len(entity.triangles) == len(poses) == 3
     box = events[0].mesh
@@ -80,8 +79,8 @@ def test_the_object_is_drawn_where_its_frame_is(events, write):
     assert not messages(write(unknown), "/object_mesh", "/object_surface")
 
 
-def test_the_last_clouds_of_all_topics_hold_all_points_known_at_that_time(make_events, write):
-    events = make_events(steps=12, free=5)
+def test_the_last_clouds_of_all_topics_hold_all_points_known_at_that_time(write):
+    events = example_events(steps=12, free=5)
     path = write(events)
     known = events[0].initial_points
     clouds = messages(path, *(topic for topic in VIEWS if topic.startswith("/all_points/")))
@@ -117,10 +116,35 @@ def test_a_simple_mesh_has_few_faces_and_the_same_shape(subdivisions):
     assert found.volume == pytest.approx(ball.volume, rel=0.1)  # faces still point outwards
 
 
+def test_the_next_probe_is_an_arrow_from_start_to_end(steered_events):
+    first, last = (nth(steered_events, Decided, number) for number in (0, -1))
+    (entity,) = SceneUpdate.FromString(next_probe(first, 5)).entities
+    (arrow,) = entity.arrows
+    pose = first.problem.actions.world_from_hand[first.decision.chosen]
+    position, q = arrow.pose.position, arrow.pose.orientation
+    np.testing.assert_allclose([position.x, position.y, position.z], pose[:3, 3])
+    along = rotation_matrices(np.array([[q.x, q.y, q.z, q.w]]))[0] @ [1.0, 0.0, 0.0]
+    np.testing.assert_allclose(along, pose[:3, 2], atol=1e-12)
+    length = first.problem.actions.length[first.decision.chosen]
+    assert np.isclose(arrow.shaft_length + arrow.head_length, length)
+    (entity,) = SceneUpdate.FromString(next_probe(last, 5)).entities
+    assert len(entity.arrows) == 0
+
+
+def test_poses_and_the_true_pose_are_there_to_the_bit(events, write):
+    path = write(events)
+    found = nth(events, HypothesesFound, -1).hypotheses
+    poses = PosesInFrame.FromString(messages(path, "/hypothesis_poses")[-1][2]).poses
+    positions = [[pose.position.x, pose.position.y, pose.position.z] for pose in poses]
+    assert positions == inverse(found.object_from_world)[:, :3, 3].tolist()
+    truth = FrameTransform.FromString(messages(path, "/object_pose")[0][2])
+    assert (truth.parent_frame_id, truth.child_frame_id) == ("world", "object")
+    assert truth.translation.y == events[0].world_from_object[1, 3]
+
+
 def test_the_layout_for_foxglove_shows_topics_and_fields_that_recordings_have():
     panels = json.loads(LAYOUT.read_text())["configById"]
-    drawn = {name for name in FOXGLOVE if name not in ("/log", "/object_pose")}
-    assert set(panels["3D!scene"]["topics"]) == drawn
+    assert set(panels["3D!scene"]["topics"]) == set(FOXGLOVE) - {"/log", "/object_pose"}
     assert panels["RosOut!log"]["topicToRender"] == "/log"
     plots = [panel for name, panel in panels.items() if name.startswith("Plot!")]
     for value in (path["value"] for panel in plots for path in panel["paths"]):

@@ -14,10 +14,9 @@ from chsel.problem.points import KnownPoints
 from chsel.problem.poses import compose
 from chsel.problem.streams import StreamKey
 from replay.events import ActionsOffered, Decided, Event, Probe, SessionEnded
-from tests.replay.rerun.test_recorder import SDF, WORKSPACE, started, write
-from tests.tools.rrd_rows import Row, read, shown_at
+from tests.replay.rerun.test_recorder import ALONG_X, SDF, WORKSPACE, started, write
+from tests.tools.rrd_rows import read, shown_at
 
-ALONG_X = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # its last column
 ACTIONS = Actions(
     compose(
         np.stack([np.eye(3), np.eye(3), ALONG_X]),
@@ -73,20 +72,14 @@ def session() -> Iterator[Event]:
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    return write(tmp_path_factory.mktemp("rerun") / "a.rrd", session())
-
-
-@pytest.fixture(scope="module")
-def rows(recording):
-    return read(recording)
+def rows(tmp_path_factory):
+    return read(write(tmp_path_factory.mktemp("rerun") / "a.rrd", session()))
 
 
 def test_every_action_is_an_arrow_along_its_way_no_longer_than_it(rows):
     shown = shown_at(rows["/scene/actions/offered"], -1)
-    np.testing.assert_allclose(
-        shown["Arrows3D:origins"], ACTIONS.world_from_hand[:, :3, 3], rtol=1e-6
-    )
+    starts = ACTIONS.world_from_hand[:, :3, 3]
+    np.testing.assert_allclose(shown["Arrows3D:origins"], starts, rtol=1e-6)
     vectors = np.array(shown["Arrows3D:vectors"])
     lengths = np.linalg.norm(vectors, axis=1)
     np.testing.assert_allclose(vectors / lengths[:, None], [[0, 0, 1], [0, 0, 1], [1, 0, 0]])
@@ -108,15 +101,6 @@ def test_the_next_probe_and_its_forecast_stand_at_the_step_before_it(rows, step,
     np.testing.assert_allclose(forecast, [[0.0, 0.0, -0.15]], rtol=1e-6)
 
 
-def curve(rows: dict[str, list[Row]], name: str) -> dict[int, float]:
-    found = rows[f"/decision/{name}"]
-    return {
-        times["probe"]: values["Scalars:scalars"][0]
-        for times, values in found
-        if "Scalars:scalars" in values
-    }
-
-
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
@@ -128,4 +112,9 @@ def curve(rows: dict[str, list[Row]], name: str) -> dict[int, float]:
     ],
 )
 def test_what_happened_stands_beside_its_forecast(rows, name, expected):
-    assert curve(rows, name) == pytest.approx(expected)
+    curve = {
+        times["probe"]: values["Scalars:scalars"][0]
+        for times, values in rows[f"/decision/{name}"]
+        if "Scalars:scalars" in values
+    }
+    assert curve == pytest.approx(expected)

@@ -1,4 +1,4 @@
-"""The Rerun recording, read back with Rerun's own reader."""
+"""The Rerun recording of a robot's session, read back with Rerun's own reader."""
 
 from __future__ import annotations
 
@@ -10,24 +10,20 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.errors import RecordingError
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import compose, inverse, random_rotations
-from chsel.problem.registration_problem import (
-    ArchiveSnapshot,
-    Hypotheses,
-    RegistrationProblem,
-)
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from replay.colors import CostScale
 from replay.events import (
     Event,
     HypothesesFound,
-    Logged,
     Measured,
     Probe,
     ProblemPosed,
+    RigDescribed,
+    SensorImage,
     SessionEnded,
     SessionStarted,
     SnapshotTaken,
@@ -37,22 +33,18 @@ from replay.events import (
 from replay.rerun import viewer as rerun_viewer
 from replay.rerun.rerun_recorder import RerunRecorder
 from replay.rerun.scene import LEVELS, cost_levels
-from tests.tools.rrd_rows import (
-    Row,
-    at_probe,
-    read,
-    until_probe,
-)
+from replay.rerun.sensors import display_size
+from tests.tools.rrd_rows import Row, at_probe, read, shown_at
 
 WORKSPACE = Workspace((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
 MESH = trimesh.creation.box(extents=(0.1, 0.2, 0.3))
 SDF = SdfGrid.from_mesh(MESH, 0.05)
 INITIAL = KnownPoints(free=np.array([[0.4, 0.4, 0.4]]))
 TRUTH = compose(np.eye(3), np.array([0.1, 0.0, 0.0]))
-MESH_ENTITIES = [
-    "/scene/hypotheses/best",
-    *(f"/scene/hypotheses/cost_step_{n + 1}" for n in range(LEVELS)),
-]
+ALONG_X = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # its last column
+HAND = trimesh.creation.box((0.1, 0.08, 0.06))
+CAMERA = compose(np.diag([1.0, -1.0, -1.0]), np.array([0.1, 0.2, 0.9]))
+INTRINSICS = np.array([8.0, 9.0, 2.5, 1.5])
 
 
 def started(world_from_object: np.ndarray | None = TRUTH) -> SessionStarted:
@@ -62,7 +54,7 @@ def started(world_from_object: np.ndarray | None = TRUTH) -> SessionStarted:
         session="simulated",
         method="chsel",
         seed=3,
-        config={"preset": {"name": "paper"}, "method": {"qd": {"bins": [40, 40]}}},
+        config={"preset": {"name": "paper"}},
         mesh=MESH,
         sdf=SDF,
         workspace=WORKSPACE,
@@ -75,83 +67,82 @@ def started(world_from_object: np.ndarray | None = TRUTH) -> SessionStarted:
 def probe(step: int) -> Probe:
     rng = np.random.default_rng(step)
     contacts = rng.uniform(-0.1, 0.1, (1 + step, 3))
-    positions = np.linspace([-0.4, 0.0, 0.0], [-0.1, 0.0, 0.01 * step], 5)
-    path = compose(np.tile(np.eye(3), (5, 1, 1)), positions)
-    return Probe(
-        step,
-        "contact",
-        KnownPoints(
-            free=rng.uniform(-0.4, 0.4, (10 + step, 3)),
-            occupied=rng.uniform(-0.4, 0.4, (2, 3)),
-            known=np.concatenate([contacts, rng.uniform(-0.4, 0.4, (3, 3))]),
-            known_sdf=np.concatenate([np.zeros(len(contacts)), np.full(3, 0.02)]),
-        ),
-        gripper_path=path,
-        contacts=contacts,
-        contact_normals=np.tile([1.0, 0.0, 0.0], (len(contacts), 1)),
+    ways = [[-0.4, 0.0, 0.0], [-0.2, 0.9, 0.0], [-0.1, 0.0, 0.01 * step], [-0.3, 0.0, 0.0]]
+    points = KnownPoints(
+        free=rng.uniform(-0.4, 0.4, (10 + step, 3)),
+        occupied=rng.uniform(-0.4, 0.4, (2, 3)),
+        known=np.concatenate([contacts, rng.uniform(-0.4, 0.4, (3, 3))]),
+        known_sdf=np.concatenate([np.zeros(len(contacts)), np.full(3, 0.02)]),
     )
+    path = compose(np.tile(ALONG_X, (4, 1, 1)), np.array(ways))
+    normals = np.outer(np.arange(1 + step) > 0, [1.0, 0.0, 0.0])  # that of the first is unknown
+    return Probe(step, "contact", points, path, contacts, normals)
 
 
-def snapshot(
-    iteration: int, shape: tuple[int, ...] = (4, 3), refinement: int = 0
-) -> ArchiveSnapshot:
-    cells = np.arange(iteration + 2)
-    names = ("x [m]", "y [m]", "z [m]")[: len(shape)]
-    zeros = np.zeros((len(cells), 9))
+def snapshot(iteration: int, shape: tuple[int, ...] = (4, 3)) -> ArchiveSnapshot:
+    cells, axes = np.arange(iteration + 2), len(shape)
     return ArchiveSnapshot(
         iteration,
-        refinement,
-        names,
+        0,
+        ("x [m]", "y [m]", "z [m]")[:axes],
         shape,
-        np.full(len(shape), -0.3),
-        np.full(len(shape), 0.3),
+        np.full(axes, -0.3),
+        np.full(axes, 0.3),
         cells,
-        zeros,
+        np.zeros((len(cells), 9)),
         -1.0 - np.arange(len(cells), dtype=np.float64),
-        np.zeros((len(cells), len(shape))),
+        np.zeros((len(cells), axes)),
     )
 
 
-def hypotheses(count: int = 6, archive: ArchiveSnapshot | None = None) -> Hypotheses:
-    rng = np.random.default_rng(count)
+def hypotheses(archive: ArchiveSnapshot) -> Hypotheses:
+    rng, count = np.random.default_rng(6), 6
     poses = compose(random_rotations(rng, count), rng.uniform(-0.2, 0.2, (count, 3)))
-    duplicate = np.arange(count) % 4 == 2
-    cell = np.full(count, -1) if archive is None else np.arange(count) % len(archive.cells)
     cost = 1.5 * np.arange(1, count + 1, dtype=np.float64) ** 2
-    return Hypotheses(poses, cost, duplicate, cell, poses, archive)
+    return Hypotheses(poses, cost, np.arange(count) % 4 == 2, np.arange(count), poses, archive)
 
 
-def registration(
-    step: int, *, shape: tuple[int, ...] | None = (4, 3), count: int = 6
-) -> Iterator[Event]:
+def registration(step: int, *, shape: tuple[int, ...] = (4, 3)) -> Iterator[Event]:
     problem = RegistrationProblem(
         SDF, INITIAL, np.eye(4)[None], WORKSPACE, 0.025, StreamKey(3, step)
     )
     yield ProblemPosed(step, problem)
     yield Traced(step, "gradient_descent", 0, "0", 2.0, 3.0, 900.0)
     yield Traced(step, "gradient_descent", 50, "0", 1.0, 2.0, 90.0 + step)
-    last = None
     for iteration in (0, 5):
-        if shape is None:
-            break
-        last = snapshot(iteration, shape)
-        yield SnapshotTaken(step, last)
+        yield SnapshotTaken(step, snapshot(iteration, shape))
         yield Traced(step, "quality_diversity", iteration, "0", 0.5, 1.0, 2.0)
-    yield HypothesesFound(step, hypotheses(count, last))
+    yield HypothesesFound(step, hypotheses(snapshot(5, shape)))
     errors = {
         "best_position_error": 0.01 * (step + 1),
         "best_rotation_error": 0.5 * (step + 1),
     }
     yield Measured(step, {**errors, "coverage_mm2": 4.0, "set_spread": 0.003})
     yield Timed(step, {"gradient_descent": 0.25})
-    yield Logged(step, "warning", f"line {step}")
 
 
-def session(count: int = 3) -> list[Event]:
-    events: list[Event] = [started()]
-    for step in range(count):
-        events += [probe(step), *registration(step)]
-    return [*events, SessionEnded(count - 1, "finished")]
+def depth(step: int, *, height: int = 4, width: int = 6) -> SensorImage:
+    values = np.arange(height * width, dtype=np.uint16).reshape(height, width) * 50
+    return SensorImage(step, "camera", "depth", values, 0.001, values > 200, INTRINSICS, CAMERA)
+
+
+def touch(step: int, pixels: int) -> SensorImage:
+    values = np.zeros((3, 5), dtype=np.uint16)
+    values.flat[:pixels] = 60
+    seen = (values, 0.0001, values > 40, INTRINSICS, CAMERA)
+    return SensorImage(step, "pad_1", "deformation", *seen)
+
+
+def session() -> Iterator[Event]:
+    """Three probes, with two images of a camera before each; the pad tells nothing of the last."""
+    yield started()
+    yield RigDescribed(-1, "cabinet", "0a1b", HAND)
+    for step in range(3):
+        yield from (depth(step), dataclasses.replace(depth(step), unit=0.002))
+        yield from (touch(step, pixels) for pixels in (1, 7, 4) if step < 2)
+        yield probe(step)
+        yield from registration(step)
+    yield SessionEnded(2, "finished")
 
 
 def write(path: Path, events: Iterable[Event]) -> Path:
@@ -162,14 +153,21 @@ def write(path: Path, events: Iterable[Event]) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    return write(tmp_path_factory.mktemp("rerun") / "recording.rrd", session())
+def shown_poses(rows: dict[str, list[Row]], root: str, step: int) -> dict[float, np.ndarray]:
+    """The poses (4, 4) at which hypotheses are shown at a probe, by their costs."""
+    poses: dict[float, np.ndarray] = {}
+    for entity in ("best", *(f"cost_step_{level + 1}" for level in range(LEVELS))):
+        row = shown_at(rows[f"{root}/{entity}"], step)
+        places = row["InstancePoses3D:translations"], row["InstancePoses3D:mat3x3"]
+        for cost, where, turn in zip(row["cost"], *places, strict=True):
+            if not np.isnan(cost):  # turn: column by column
+                poses[cost] = compose(np.reshape(turn, (3, 3)).T, np.array(where))
+    return poses
 
 
 @pytest.fixture(scope="module")
-def rows(recording):
-    return read(recording)
+def rows(tmp_path_factory):
+    return read(write(tmp_path_factory.mktemp("rerun") / "recording.rrd", session()))
 
 
 def test_contacts_and_points_are_those_of_the_probe(rows):
@@ -185,54 +183,28 @@ def test_contacts_and_points_are_those_of_the_probe(rows):
         }
         for name, positions in expected.items():
             shown = at_probe(rows[f"/scene/{name}"], step)[-1]["Points3D:positions"]
-            np.testing.assert_array_equal(
-                np.array(shown, dtype=np.float32), positions.astype(np.float32)
-            )
+            np.testing.assert_array_equal(np.float32(shown), np.float32(positions))
 
 
-def test_normals_are_arrows_at_the_contacts_that_have_one(tmp_path):
-    normals = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    event = dataclasses.replace(probe(1), contact_normals=normals)
-    arrows = read(write(tmp_path / "a.rrd", [started(), event]))["/scene/contacts/normals"][-1][1]
-    np.testing.assert_array_equal(
-        np.array(arrows["Arrows3D:origins"], dtype=np.float32),
-        event.contacts[1:].astype(np.float32),
-    )
-    np.testing.assert_allclose(
-        arrows["Arrows3D:vectors"], [[0.0, 0.0, 0.035 * np.sqrt(3.0)]], rtol=1e-6
-    )
-
-
-def test_the_object_stands_at_its_true_pose(rows):
+def test_normals_are_arrows_at_the_contacts_that_have_one_and_the_object_is_at_its_pose(rows):
+    arrows = at_probe(rows["/scene/contacts/normals"], 2)[-1]
+    np.testing.assert_allclose(arrows["Arrows3D:origins"], probe(2).contacts[1:], rtol=1e-6)
+    length = 0.035 * np.sqrt(3.0)
+    np.testing.assert_allclose(arrows["Arrows3D:vectors"], [[length, 0.0, 0.0]] * 2, rtol=1e-6)
     values = {name: value for _, row in rows["/scene/object"] for name, value in row.items()}
     np.testing.assert_allclose(values["Transform3D:translation"], [[0.1, 0.0, 0.0]], rtol=1e-6)
     assert len(values["Mesh3D:triangle_indices"]) == len(MESH.faces)
 
 
-def shown_hypotheses(rows: dict[str, list[Row]], step: int) -> dict[float, tuple[np.ndarray, str]]:
-    """Pose and entity of each hypothesis drawn at a probe, by cost."""
-    found: dict[float, tuple[np.ndarray, str]] = {}
-    for entity in MESH_ENTITIES:
-        row = until_probe(rows[entity], step)[-1]
-        translations = row["InstancePoses3D:translations"]
-        for cost, where, turn in zip(
-            row["cost"], translations, row["InstancePoses3D:mat3x3"], strict=True
-        ):
-            if not np.isnan(cost):
-                columns = np.reshape(turn, (3, 3)).T  # stored column by column
-                found[cost] = (compose(columns, np.array(where)), entity)
-    return found
-
-
 def test_every_distinct_hypothesis_is_drawn_once_at_its_pose(rows):
-    expected = hypotheses(6, snapshot(5))
+    expected = hypotheses(snapshot(5))
     distinct = np.flatnonzero(~expected.duplicate)
     for step in range(3):
-        shown = shown_hypotheses(rows, step)
+        shown = shown_poses(rows, "/scene/hypotheses", step)
         assert sorted(shown) == expected.cost[distinct].tolist()
         for index in distinct:
-            pose, _ = shown[float(expected.cost[index])]
             world_from_object = inverse(expected.object_from_world[index])
+            pose = shown[float(expected.cost[index])]
             np.testing.assert_allclose(pose, world_from_object, atol=1e-6)
 
 
@@ -251,62 +223,14 @@ def images(rows: list[Row], step: int, dtype: type, channels: int) -> list[np.nd
 
 def test_the_archive_shows_the_cost_of_each_cell_and_marks_empty_ones(rows):
     first, last = images(rows["/archive/cost"], 1, np.float32, 1)
-    costs = first[..., 0]  # cells 0 and 1 of 4 x 3: first column, from below
-    expected = np.full((3, 4), np.nan)
+    expected = np.full((3, 4), np.nan)  # cells 0 and 1 of 4 x 3: first column, from below
     expected[2, 0], expected[1, 0] = 1.0, 2.0
-    np.testing.assert_array_equal(costs, expected)
+    np.testing.assert_array_equal(first[..., 0], expected)
     assert np.isfinite(last).sum() == 7
     colors = images(rows["/archive/colors"], 1, np.uint8, 3)[-1]
     empty = np.isnan(last[..., 0])
     assert len(np.unique(colors[empty], axis=0)) == 1
     assert len(np.unique(colors[~empty], axis=0)) == 7
-
-
-def test_hypotheses_are_marked_in_their_cells(rows):
-    marks = at_probe(rows["/archive/hypotheses"], 0)[-1]
-    np.testing.assert_allclose(  # cells 0, 1, 3, 4, 5 of 4 x 3, y down
-        marks["Points2D:positions"], [(0.5, 2.5), (0.5, 1.5), (1.5, 2.5), (1.5, 1.5), (1.5, 0.5)]
-    )
-    assert marks["Points2D:labels"][:2] == ["cost 1.5", "cost 6"]
-
-
-def test_iterations_run_on_over_stages_and_registrations(rows):
-    drawn = [times for times, values in rows["/archive/cost"] if "Image:buffer" in values]
-    times = [(times["probe"], times["iteration"]) for times in drawn]
-    assert times == [(0, 51), (0, 56), (1, 107), (1, 112), (2, 163), (2, 168)]
-
-
-def test_costs_of_the_search_are_on_the_timeline_of_iterations_alone(rows):
-    series = [
-        (times, values["Scalars:scalars"][0])
-        for times, values in rows["/search/highest"]
-        if "Scalars:scalars" in values
-    ]
-    assert [set(times) for times, _ in series] == [{"iteration"}] * 12
-    assert [value for _, value in series[:5]] == [900.0, 90.0, 2.0, 2.0, 900.0]
-
-
-@pytest.mark.parametrize(
-    ("entity", "expected"),
-    [
-        ("/cost/lowest", [1.5] * 3),
-        ("/cost/median", [18.75] * 3),
-        ("/cost/highest", [54.0] * 3),
-        ("/distinct/hypotheses", [5.0] * 3),
-        ("/error/position/best", [10.0, 20.0, 30.0]),
-        ("/error/rotation/best", [0.5 * n * 180.0 / np.pi for n in (1, 2, 3)]),
-        ("/measured/coverage_mm2", [4.0] * 3),
-        ("/trust/set_spread", [3.0] * 3),
-        ("/seconds/gradient_descent", [0.25] * 3),
-    ],
-)
-def test_numbers_of_a_step_stand_at_its_probe(rows, entity, expected):
-    series = {
-        times["probe"]: values["Scalars:scalars"]
-        for times, values in rows[entity]
-        if "Scalars:scalars" in values
-    }
-    assert series == {step: [pytest.approx(value)] for step, value in enumerate(expected)}
 
 
 def test_of_cells_over_a_third_measure_the_lowest_cost_is_shown(tmp_path):
@@ -317,9 +241,88 @@ def test_of_cells_over_a_third_measure_the_lowest_cost_is_shown(tmp_path):
     assert costs[1, 0] == 3.0
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path):
-    with pytest.raises(RecordingError, match=r"cannot be written .*accepted: a new \.rrd file"):
-        RerunRecorder(tmp_path)
+def test_hypotheses_are_marked_in_their_cells(rows):
+    marks = at_probe(rows["/archive/hypotheses"], 0)[-1]
+    np.testing.assert_allclose(  # cells 0, 1, 3, 4, 5 of 4 x 3, y down
+        marks["Points2D:positions"], [(0.5, 2.5), (0.5, 1.5), (1.5, 2.5), (1.5, 1.5), (1.5, 0.5)]
+    )
+    assert marks["Points2D:labels"][:2] == ["cost 1.5", "cost 6"]
+
+
+def test_iterations_run_on_over_images_stages_and_registrations(rows):
+    drawn = [times for times, values in rows["/archive/cost"] if "Image:buffer" in values]
+    times = [(times["probe"], times["iteration"]) for times in drawn]
+    assert times == [(0, 56), (0, 61), (1, 117), (1, 122), (2, 175), (2, 180)]
+    series = [
+        (times, values["Scalars:scalars"][0])
+        for times, values in rows["/search/highest"]
+        if "Scalars:scalars" in values
+    ]
+    assert [set(times) for times, _ in series] == [{"iteration"}] * 12
+    assert [value for _, value in series[:5]] == [900.0, 90.0, 2.0, 2.0, 900.0]
+
+
+def test_numbers_of_a_step_stand_at_its_probe(rows):
+    for entity, expected in {
+        "/cost/lowest": [1.5] * 3,
+        "/cost/median": [18.75] * 3,
+        "/cost/highest": [54.0] * 3,
+        "/distinct/hypotheses": [5.0] * 3,
+        "/error/position/best": [10.0, 20.0, 30.0],
+        "/error/rotation/best": [0.5 * n * 180.0 / np.pi for n in (1, 2, 3)],
+        "/measured/coverage_mm2": [4.0] * 3,
+        "/trust/set_spread": [3.0] * 3,
+        "/seconds/gradient_descent": [0.25] * 3,
+    }.items():
+        series = {
+            times["probe"]: values["Scalars:scalars"]
+            for times, values in rows[entity]
+            if "Scalars:scalars" in values
+        }
+        assert series == {step: [pytest.approx(value)] for step, value in enumerate(expected)}
+
+
+def test_the_hand_is_drawn_where_the_probe_is_deepest(rows):
+    for step in range(3):
+        shown = shown_at(rows["/scene/hand"], step)
+        np.testing.assert_allclose(
+            shown["InstancePoses3D:translations"], [[-0.1, 0.0, 0.01 * step]], rtol=1e-6
+        )
+    assert not np.any(at_probe(rows["/scene/hand"], 0)[0]["InstancePoses3D:mat3x3"])
+    mesh = next(values for _, values in rows["/scene/hand"] if "Mesh3D:vertex_positions" in values)
+    np.testing.assert_allclose(np.max(mesh["Mesh3D:vertex_positions"], axis=0), [0.05, 0.04, 0.03])
+
+
+def test_a_camera_stands_at_its_pose_and_sees_what_it_measured(rows):
+    camera = at_probe(rows["/scene/cameras/camera"], 1)[-1]
+    np.testing.assert_allclose(camera["Transform3D:translation"], [[0.1, 0.2, 0.9]], rtol=1e-6)
+    np.testing.assert_allclose(
+        np.reshape(camera["Pinhole:image_from_camera"], (3, 3)).T,
+        [[8.0, 0.0, 2.5], [0.0, 9.0, 1.5], [0.0, 0.0, 1.0]],
+    )
+    seen = at_probe(rows["/scene/cameras/camera/depth"], 1)[-1]
+    (buffer,) = seen["DepthImage:buffer"]
+    assert bytes(buffer) == depth(1).values.tobytes()
+    assert seen["DepthImage:meter"] == [500.0]  # of the last image, of 2 mm a unit
+
+
+def test_each_image_has_its_moment_and_a_probe_shows_the_largest_contact(rows):
+    drawn = [
+        (times["iteration"], list(buffer).count(0))
+        for times, values in rows["/sensors/pad_1/pixels"]
+        for buffer in values.get("SegmentationImage:buffer", ())
+        if times["probe"] == 0
+    ]
+    assert drawn == [(3, 1), (4, 7), (5, 4), (5, 7)]  # after the two of the camera
+
+
+def test_large_images_are_thinned_out_for_the_eye():
+    large = depth(0, height=5, width=1000)
+    small = display_size(large)
+    assert small.values.tolist() == large.values[::4, ::4].tolist()
+    assert small.mask.tolist() == large.mask[::4, ::4].tolist()
+    assert small.intrinsics.tolist() == [2.0, 2.25, 0.625, 0.375]
+    assert display_size(depth(0)).values.shape == (4, 6)
 
 
 def test_without_a_viewer_the_live_view_is_a_warning(tmp_path, monkeypatch):
@@ -335,12 +338,9 @@ def test_without_a_viewer_the_live_view_is_a_warning(tmp_path, monkeypatch):
     assert "/scene/workspace" in read(tmp_path / "a.rrd")
 
 
-def test_places_on_the_scale_are_logarithmic():
+def test_the_scale_of_costs_is_logarithmic_from_the_lowest_to_the_highest():
     scale = CostScale.of([100.0, 1.0, 7.0, np.nan])
     np.testing.assert_allclose(scale.fraction([1.0, 10.0, 100.0, 500.0]), [0.0, 0.5, 1.0, 1.0])
-
-
-def test_steps_of_cost_run_from_the_lowest_to_the_highest():
     assert cost_levels(np.array([1.0, 16.0, 256.0])).tolist() == [0, LEVELS // 2, LEVELS - 1]
     assert cost_levels(np.array([2.0, 2.0])).tolist() == [0, 0]
     assert cost_levels(np.zeros(0)).tolist() == []

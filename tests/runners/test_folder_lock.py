@@ -1,0 +1,24 @@
+"""One run at a time writes into the folder of an evaluation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from filelock import FileLock, Timeout
+
+from runners.evaluation.experiment import LOCK, writing_alone
+
+
+def test_a_second_run_in_a_folder_waits_for_the_first(tmp_path: Path) -> None:
+    lock, said = FileLock(tmp_path / LOCK), list[str]()
+    lock.acquire()
+
+    def end_the_first(line: str) -> None:
+        said.append(line)
+        lock.release()
+
+    with writing_alone(tmp_path, end_the_first):
+        assert said == [f"another run is at work in {tmp_path}; this one waits until it ends"]
+        with pytest.raises(Timeout):
+            lock.acquire(timeout=0)
