@@ -56,7 +56,7 @@ def main(config: DictConfig) -> None:
             PackageSession(package, checked.folder, trial, draw, session, steps)
             for draw in range(checked.draws)
             for trial, session in trials
-            if (steps := read_told(session.with_suffix(".json")).steps)
+            if (steps := tuple(read_told(session.parent)["steps"]))
         ]
         missing = [one for one in sessions if one.failures() is None]
         console.print(

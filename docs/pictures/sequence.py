@@ -11,7 +11,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import inverse
 from docs.pictures.outlines import CONTACT, TRUE_POSE, Frame, Outlines, corners_in, save_figure
 from replay.mcap.reader import read_recording
-from runners.reporting.figures import WIDTH, drawing, method_styles, new_figure
+from runners.reporting.figures import WIDTH, drawing, new_figure, styles_of
 
 _STEPS = 4
 _APPROACH = 0.05  # metres of the gripper's way that are drawn before a contact
@@ -33,7 +33,7 @@ def main(out: str, *named: str) -> None:
     """A row for each method, a column for each of the first, the last and two steps between."""
     files = dict(text.split("=", 1) for text in named)
     recordings = {method: read_recording(Path(file)) for method, file in files.items()}
-    first, styles = next(iter(recordings.values())), method_styles(list(files))
+    first, styles = next(iter(recordings.values())), styles_of(list(files))
     common = [step for step in first.steps if all(step in r.steps for r in recordings.values())]
     steps = [common[round(place)] for place in np.linspace(0, len(common) - 1, _STEPS)]
     mesh, truth = first.start.mesh, first.start.world_from_object

@@ -13,7 +13,7 @@ import numpy as np
 from chsel.methods import preset_settings
 from chsel.methods.method import Method
 from chsel.numerics.threads import threads
-from chsel.plausible.plausible_set import PlausibleSet
+from chsel.plausible.plausible_set import PlausibleSet, load_plausible
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.settings import settings_mapping
@@ -21,7 +21,12 @@ from runners.benchmarks.timing import Row
 from runners.evaluation.contenders import chosen_contenders
 from runners.evaluation.metrics import HypothesisMetrics, MetricsConfig
 from runners.evaluation.plan import OWN, Plan, Trial
-from runners.evaluation.trial_session import load_members, make_session, open_recorded, problems
+from runners.evaluation.trial_session import (
+    make_session,
+    open_recorded,
+    plausible_settings_of,
+    problems,
+)
 
 PD, TIME = "PD over time", "PD over time, time"
 """Measures: rows of the former have the median time, milliseconds, as their place."""
@@ -102,13 +107,16 @@ def pd_over_time() -> Iterator[Row]:
             members: dict[int, PlausibleSet] = {}  # by step
             mesh, truth = session.recorded.mesh, session.world_from_object
             metrics = HypothesisMetrics(plan.metrics, mesh, truth)
+            settings = plausible_settings_of(plan, session)
             for case, method in methods.items():
                 for problem in problems(plan, trial, session, method.online):
                     milliseconds, found = _timed(method, problem, warm=bool(taken[case]))
                     taken[case].append(milliseconds)
                     step = problem.key.step
                     if step not in members:
-                        members[step] = load_members(plan, trial, session, problem)
+                        there = load_plausible(trial.folder(plan) / "plausible", problem, settings)
+                        assert there is not None
+                        members[step] = there
                     measured = metrics.compute(problem, members[step], found, ranked=False)
                     diversity[case].append(measured.get("diversity", np.inf))
     for case, samples in taken.items():
@@ -132,8 +140,7 @@ def _timed(method: Method, problem: RegistrationProblem, *, warm: bool) -> tuple
 def _method(curve: str, changes: Mapping[str, Any]) -> Method:
     name, _, preset = curve.partition("@")
     entry = {"name": name, "settings": changes}
-    (contender,) = chosen_contenders([entry], {}, preset or "default")
-    return contender.method()
+    return chosen_contenders([entry], {}, preset or "default")[name].method()
 
 
 def _plan(folder: Path) -> Plan:

@@ -21,8 +21,8 @@ from chsel.problem.streams import Purpose
 from chsel.qd.selection import repeated
 from replay.files import file_digest, whole_file
 from runners.evaluation.contenders import repeat_label, repeat_seed
-from runners.evaluation.external_results import REPEAT_FOLDER
 from runners.evaluation.plan import Task, Trial
+from runners.evaluation.run_method import REPEAT_FOLDER
 from runners.published_package.process import PublishedPackage, RefusedError
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 
