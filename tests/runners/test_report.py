@@ -95,20 +95,6 @@ def test_what_has_no_number_is_left_out_and_counted(tmp_path: Path) -> None:
     ]
 
 
-def test_ranks_and_shares_of_members_are_those_of_the_last_half(tmp_path: Path) -> None:
-    rows = [
-        row("can", seed, method, step, rank=rank if step == 5 else 1.0, exact_members=exact)
-        for seed in (0, 1)
-        for method, rank, exact in (("chsel", 0.2, 0.75), ("icp", 0.6, 0.25))
-        for step in (4, 5)
-    ]
-    tables = tables_of(write_evaluation(tmp_path, rows))
-    ranks = tables["Rank of the true pose among the hypotheses"]
-    assert ranks[1] == ["can", "2", "0.2 [0.2, 0.2]", "0.6 [0.6, 0.6]"]
-    members = tables["Share of hypotheses in the plausible set"]
-    assert members[1] == ["can", "2", "0.75 [0.75, 0.75]", "0.25 [0.25, 0.25]"]
-
-
 def test_true_poses_that_were_sought_have_a_table_of_their_own(tmp_path: Path) -> None:
     names = ["cabinet_drill", "cabinet_mustard"]
     write_evaluation(tmp_path, [], configurations=names, seeds=[0, 1, 2])

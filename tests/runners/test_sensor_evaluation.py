@@ -139,7 +139,6 @@ def test_a_pose_set_by_hand_is_near_the_truth_but_not_it() -> None:
             "no seed_0.pose.yaml beside it",
         ),
         (("session=sensors", "session.logs=LOGS", "seeds=4"), "seed_4.mcap; accepted: seeds"),
-        (("session=sensors", "configurations=mustard_fallen"), "mustard_sideways"),
     ],
 )
 def test_an_evaluation_of_logs_that_cannot_be_is_one_line(

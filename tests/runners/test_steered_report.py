@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +14,6 @@ from runners.reporting.sections import sections_of
 from runners.reporting.statistics import (
     SteeredSessions,
     bootstrap_interval,
-    censored_quantile,
-    first_below,
     geometric_means,
     paired,
     ratios_to_best,
@@ -44,21 +41,6 @@ def rows() -> list[Row]:
         *session("drill", 20, "information", [60.0, 60.0, 60.0, 60.0]),
         *session("drill", 20, "grid", [60.0, 70.0, 65.0, 30.0]),
     ]
-
-
-def test_a_session_that_never_gets_there_needs_more_than_the_budget(
-    tmp_path: Path, rows: list[Row]
-) -> None:
-    errors = sessions_of(tmp_path, rows).errors
-    needed = first_below(errors.loc["information"], 0.010)
-    assert needed.to_dict() == {("can", 20): 2.0, ("can", 21): 3.0, ("drill", 20): math.inf}
-    # 10 mm is not below 10 mm.
-    assert first_below(errors.loc["grid"], 0.010).tolist() == [math.inf, 4.0, math.inf]
-    # The mean of those that got there, 2.5, would make the policy better by its failures.
-    assert censored_quantile(needed, 0.5) == 3.0
-    assert censored_quantile(first_below(errors.loc["grid"], 0.010), 0.5) == math.inf
-    assert censored_quantile(pd.Series([1.0, 2.0, math.inf, math.inf]), 0.5) == 2.0
-    assert math.isnan(censored_quantile(pd.Series([], dtype=float), 0.5))
 
 
 def test_a_session_that_ends_early_keeps_its_error(tmp_path: Path, rows: list[Row]) -> None:
