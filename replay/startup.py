@@ -25,7 +25,6 @@ EXTRAS = {
     "sim": ("pooch", "pybullet", "requests"),
     "sensors": ("PIL", "mcap_ros2", "yourdfpy"),
     "evaluate": ("bokeh", "cryptography", "dask", "distributed", "markdown_it", "matplotlib"),
-    "slurm": ("dask_jobqueue",),
 }
 """The modules that each extra of this package installs."""
 

@@ -26,8 +26,8 @@ from replay.files import file_digest, whole_file
 from runners.command.program import command, plain
 from runners.evaluation.contenders import repeat_label, repeat_seed, require_repeats
 from runners.evaluation.experiment import read_experiment
-from runners.evaluation.external_results import REPEAT_FOLDER
 from runners.evaluation.plan import Task, Trial
+from runners.evaluation.run_method import REPEAT_FOLDER
 from runners.evaluation.trial_configurations import chosen_names, chosen_seeds
 from runners.evaluation.trial_session import read_told
 from runners.published_package.process import (
@@ -76,7 +76,7 @@ def main(config: DictConfig) -> None:
             PackageSession(package, checked.folder, trial, draw, session, steps)
             for draw in range(checked.draws)
             for trial, session in trials
-            if (steps := read_told(session.with_suffix(".json")).steps)
+            if (steps := tuple(read_told(session.parent)["steps"]))
         ]
         missing = [one for one in sessions if one.failures() is None]
         console.print(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from math import degrees, pi
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,25 +26,19 @@ from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
-from chsel.problem.settings import CheckedSettings, build_settings, positive
+from chsel.problem.settings import CheckedSettings, build_settings
 from chsel.problem.streams import Purpose, StreamKey, uniforms
 from chsel.rehearsal import warm_up
 from replay.console import Console, Progress
-from replay.events import Probe
 from replay.files import whole_file
 from runners.command.program import command, plain
 from runners.evaluation.contenders import chosen_contenders
 from runners.evaluation.trial_configurations import chosen_names, chosen_seeds
-from runners.objects.loader import ObjectConfig, load_object
-from runners.reporting.statistics import spreads
-from runners.reporting.tables import Table, number, print_table
+from runners.reporting.tables import Table, print_table, table_of
 from runners.run.display import compiling_line
 from runners.run.scene import PresetName
 from runners.sensors.depth_frame import SUFFIXES as FRAMES
-from runners.sensors.rig import Rig
-from runners.sessions import open_session
-from runners.sessions.points import PointsSettings
-from runners.sessions.sensors import SensorsSettings
+from runners.sessions.problem_source import open_source
 
 _RIGHT = (0.005, pi / 36.0)  # m and radians (5 degrees): errors of a hypothesis that is right
 _EPSILON = 0.001  # m, of plausible sets, which are not made here
@@ -76,9 +71,8 @@ class RealConfig(CheckedSettings):
     seeds: Any
     methods: Any
     settings: Any
-    passes: Annotated[int, positive]
     halves: bool
-    rig: Rig
+    rig: Any
     preset: PresetName
     out: str
     threads: Annotated[int, require_threads]
@@ -95,7 +89,7 @@ def main(config: DictConfig) -> None:
             f"data is {checked.data}; accepted: a folder with real/, by data=FOLDER or CHSEL_DATA"
         )
     contenders = chosen_contenders(checked.methods, checked.settings, checked.preset.name)
-    methods = {contender.label: contender.method() for contender in contenders}
+    methods = {label: contender.method() for label, contender in contenders.items()}
     rows: list[Mapping[str, Any]] = []
     with threads(checked.threads):
         opened = [RealCase(checked, name) for name in cases]
@@ -105,13 +99,11 @@ def main(config: DictConfig) -> None:
         waiting = Console(stderr=True)
         with Progress(console=waiting, transient=True, disable=not waiting.is_terminal) as bar:
             for case in bar.track(opened, description="cases"):
-                for label, method in methods.items():
-                    rows += case.rows(label, method, seeds)
-                rows += case.published()
+                rows += case.rows(methods, seeds)
     file = Path(checked.out).expanduser() / "results.csv"
     with whole_file(file) as beside:
         pa.csv.write_csv(pa.Table.from_pylist(rows), beside)
-    print_table(console, _table(rows))
+    print_table(console, _table(pd.DataFrame(rows)))
     console.print(str(file), soft_wrap=True)
 
 
@@ -122,49 +114,42 @@ class RealCase:
         """Raises SettingError if there are too few touches, and what opening a session raises."""
         case = build_settings(CaseConfig, config.cases[name], f"cases.{name}")
         folder = Path(config.data or "").expanduser() / "real"
-        path, mesh = str(folder / case.path), str(folder / case.mesh)
-        model = load_object(ObjectConfig(name, 1.0, _EPSILON, name, "file", mesh), folder)
-        frame = Path(path).suffix.lower() in FRAMES
-        kind, cls = ("sensors", SensorsSettings) if frame else ("points", PointsSettings)
-        more: dict[str, Any] = {"rig": config.rig, "images": False} if frame else {}
-        settings: Any = cls(path=path, **more)
-        self._session = open_session(kind, settings, model, 0)
-        self._sdf = model.grid(settings)
-        probes = [event for event in self._session.probes() if isinstance(event, Probe)]
-        parts = [self._session.initial_points, *(probe.new_points for probe in probes)]
-        self._points = KnownPoints.joined(parts)
-        if len(self._points.contacts) < 2:
-            raise SettingError(f"{name} has {len(self._points.contacts)} touches; accepted: from 2")
-        self._mesh, self._symmetry = model.mesh, object_symmetry(model.mesh)
-        self._config, self._name = config, name
+        model = {"name": name, "scale": 1.0, "epsilon": _EPSILON, "configuration": name}
+        model |= {"kind": "file", "path": str(folder / case.mesh)}
+        frame = Path(case.path).suffix.lower() in FRAMES
+        session = {"kind": "sensors", "rig": config.rig} if frame else {"kind": "points"}
+        self._source = open_source(folder / case.path, model, session, folder, 0)
+        self._given = self._source.problems.problem(self._source.steps[-1])
+        self._touches = self._given.points.contacts
+        if len(self._touches) < 2:
+            raise SettingError(f"{name} has {len(self._touches)} touches; accepted: from 2")
+        self._symmetry, self._config, self._name = object_symmetry(self._source.mesh), config, name
 
-    def rows(self, label: str, method: Method, seeds: Sequence[int]) -> Iterator[dict[str, Any]]:
-        """A row for every seed and, where wanted, another of its half of the touches."""
-        count = len(self._points.contacts)
-        for seed in seeds:
-            about = {"case": self._name, "method": label, "seed": seed, "points": _ALL}
-            yield about | self._numbers(method, seed, np.arange(count))
+    def rows(self, methods: Mapping[str, Method], seeds: Sequence[int]) -> Iterator[dict[str, Any]]:
+        """A row for every method and seed and, where wanted, another of its half of the touches.
+
+        Last one of the true pose itself, where it is known: what residual there is to reach.
+        """
+        every = np.arange(len(self._touches))
+        for (label, method), seed in product(methods.items(), seeds):
+            about = {"case": self._name, "method": label, "seed": seed}
+            yield {**about, "points": _ALL, **self._numbers(method, seed, every)}
             if self._config.halves:
                 stream = StreamKey(seed, 0).stream(Purpose.CONTACT_POINTS, _SPLIT)
-                order = np.argsort(uniforms(stream, 0.0, 1.0, count), kind="stable")
-                kept = np.sort(order[: (count + 1) // 2])
-                yield about | {"points": _HALF} | self._numbers(method, seed, kept)
-
-    def published(self) -> Iterator[dict[str, Any]]:
-        """A row of the true pose itself, where it is known: what residual there is to reach."""
-        if (truth := self._session.world_from_object) is not None:
+                order = np.argsort(uniforms(stream, 0.0, 1.0, len(every)), kind="stable")
+                kept = np.sort(order[: (len(every) + 1) // 2])
+                yield {**about, "points": _HALF, **self._numbers(method, seed, kept)}
+        if (truth := self._source.world_from_object) is not None:
             about = {"case": self._name, "method": "(published)", "points": _ALL}
-            every = np.arange(len(self._points.contacts))
             yield about | self._counts(every, inverse(truth[None])[0])
 
     def _counts(self, kept: IntArray, pose: FloatArray) -> dict[str, Any]:
         """Numbers of points, and how far all touches are from the surface in a pose (4, 4)."""
-        touches = self._points.contacts
-        away = np.abs(mesh_sdf(self._mesh, apply(pose, touches))[0])  # (C,), metres
-        rest = np.delete(np.arange(len(touches)), kept)
+        away = np.abs(mesh_sdf(self._source.mesh, apply(pose, self._touches))[0])  # (C,), metres
+        rest = np.delete(np.arange(len(away)), kept)
         return {
             "touches": len(kept),
-            "free_points": len(self._points.free),
+            "free_points": len(self._given.points.free),
             "residual": float(away[kept].mean()),
             "held_out": float(away[rest].mean()) if len(rest) else None,
             **dict.fromkeys(("position_error", "rotation_error", "right", "truth_held")),
@@ -172,49 +157,42 @@ class RealCase:
 
     def _numbers(self, method: Method, seed: int, kept: IntArray) -> dict[str, Any]:
         """What comes of registering these of the touches; lengths in metres, angles in radians."""
-        session = self._session
-        points = KnownPoints(free=self._points.free, known=self._points.contacts[kept])
-        place = (self._sdf, session.workspace, session.free_resolution)
+        given = self._given
+        points = KnownPoints(free=given.points.free, known=self._touches[kept])
+        place = (given.sdf, given.workspace, given.free_resolution)
         online = OnlineRegistration(*place, method.online, seed=seed, points=points)
-        for step in range(self._config.passes):
-            problem, begun = online.pose(step), time.perf_counter()
-            found = method.register(problem)
-            seconds = time.perf_counter() - begun
-            online.remember(found)
+        problem, begun = online.pose(0), time.perf_counter()
+        found = method.register(problem)
+        seconds = time.perf_counter() - begun
         best = found.object_from_world[:1]
         numbers = {"best_cost": float(found.cost[0]), **self._counts(kept, best[0])}
-        if session.world_from_object is not None:
-            errors = pose_errors(best, session.world_from_object, self._symmetry)
+        if (truth := self._source.world_from_object) is not None:
+            errors = pose_errors(best, truth, self._symmetry)
             position, rotation = (float(error[0]) for error in errors)
             numbers |= {"position_error": position, "rotation_error": rotation}
             numbers["right"] = position <= _RIGHT[0] and rotation <= _RIGHT[1]
             if (holds := getattr(method, "holds", None)) is not None:
-                truth = inverse(session.world_from_object[None])
-                numbers["truth_held"] = bool(holds(problem, found, truth)[0])
+                numbers["truth_held"] = bool(holds(problem, found, inverse(truth[None]))[0])
         return numbers | {"seconds": seconds, "digest": found.digest}
 
 
-def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
+def _table(rows: pd.DataFrame) -> Table:
     """Medians over seeds of every case and method."""
-    table, by = pd.DataFrame(rows), ["points", "case", "method"]
-    medians = {column: spreads(table, by, column) for column, *_ in _MEDIANS}
     lines = []
-    for (case, method), own in table.groupby(by[1:], sort=False):
+    for (case, method), own in rows.groupby(["case", "method"], sort=False):
         every = own[own["points"] == _ALL]
         right = every["right"].dropna()
-        shares = f"{sum(right)}/{len(right)}" if len(right) else "-"
-        texts = [str(case), str(method), str(every["touches"].iloc[0]), shares]
-        for column, points, _, scale in _MEDIANS:
-            found = medians[column].reindex([(points, case, method)]).iloc[0]
-            texts.append(number(scale * found["median"]))
-        lines.append(tuple(texts))
-    header = ("case", "method", "tou-\nches", "right", *(text for _, _, text, _ in _MEDIANS))
+        line = {"case": case, "method": method, "tou-\nches": every["touches"].iloc[0]}
+        line["right"] = f"{sum(right)}/{len(right)}" if len(right) else "-"
+        for column, points, heading, scale in _MEDIANS:
+            some = own.loc[own["points"] == points, column].astype(float)
+            line[heading] = float(scale * some.median())
+        lines.append(line)
     note = (
-        "Of the best hypothesis. Residual: mean |SDF| of all touches; held out: that of a random "
-        "half, registered on the other. Right: within 5 mm and 5 degrees of the published pose, "
-        "modulo symmetries."
+        "Of the best hypothesis. Residual: mean |SDF| of all touches; held out: of a random half, "
+        "registered on the other. Right: within 5 mm and 5 degrees of the published pose."
     )
-    return Table("Medians over seeds", header, tuple(lines), labels=2, note=note)
+    return table_of("Medians over seeds", lines, labels=2, note=note)
 
 
 if __name__ == "__main__":

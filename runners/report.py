@@ -15,12 +15,9 @@ from replay.files import whole_file
 from runners.command.program import command, plain
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.figures import FORMATS, drawing, write_picture
-from runners.reporting.method_sections import sections_on_methods
 from runners.reporting.page import as_html, as_markdown
-from runners.reporting.policy_sections import sections_on_policies
+from runners.reporting.sections import BASELINE, sections_of
 from runners.reporting.tables import print_table
-
-_ACCEPTED = "an out=DIR that can be written"
 
 
 @dataclass(frozen=True)
@@ -42,40 +39,33 @@ class ReportConfig:
 def main(config: DictConfig) -> None:
     """Draw all figures, and write the page, the Markdown, the pictures and their data."""
     checked = build_settings(ReportConfig, plain(config), "report")
-    folder = Path(checked.dir or "").expanduser()
+    folder, kind = Path(checked.dir or "").expanduser(), checked.format
     out = Path(checked.out).expanduser() if checked.out else folder / "report"
     evaluation, console = open_evaluation(folder), Console()
+    files: list[Path] = []
+    contents: dict[str, bytes] = {}
     with drawing():
-        if evaluation.experiment["policies"]:
-            sections = sections_on_policies(evaluation, checked.baseline)
-            printed = sections[1:]
-        else:
-            sections = sections_on_methods(evaluation, checked.baseline)
-            printed = [s for s in sections if s.title == f"All methods beside {checked.baseline}"]
-        files: list[Path] = []
-        contents: dict[str, bytes] = {}
+        sections = sections_of(evaluation, checked.baseline)
+        steered = bool(evaluation.experiment["policies"])
+        printed = sections[1:] if steered else [s for s in sections if s.title == BASELINE]
         for picture in (section.picture for section in sections if section.picture):
-            picture.figure.suptitle(evaluation.name)
-            files += write_picture(picture, out, checked.format, accepted=_ACCEPTED)
-            if checked.format != "pdf":  # which pages cannot show
+            picture.figure.suptitle(evaluation.experiment["name"])
+            files += write_picture(picture, out, kind)
+            if kind != "pdf":  # which pages cannot show
                 contents[files[-2].name] = files[-2].read_bytes()
-    markdown = as_markdown(evaluation, sections, _command(checked), checked.format)
+    given = {"baseline": checked.baseline, "format": None if kind == FORMATS[0] else kind}
+    settings = [f"{name}={value}" for name, value in given.items() if value]
+    made = shlex.join(["python", "-m", "runners.report", str(checked.dir), *settings])
+    markdown = as_markdown(evaluation, sections, made, kind)
     texts = {"report.md": markdown, "report.html": as_html(markdown, contents)}
     for name, text in texts.items():
-        with whole_file(out / name, _ACCEPTED) as beside:
+        with whole_file(out / name) as beside:
             beside.write_text(text, encoding="utf-8")
         files.append(out / name)
     for table in (table for section in printed for table in section.tables if table.rows):
         print_table(console, table)
         console.print()
     print_written(*files)
-
-
-def _command(config: ReportConfig) -> str:
-    """What makes these bytes again, wherever they go."""
-    settings = [] if config.baseline is None else [f"baseline={config.baseline}"]
-    settings += [] if config.format == FORMATS[0] else [f"format={config.format}"]
-    return shlex.join(["python", "-m", "runners.report", str(config.dir), *settings])
 
 
 if __name__ == "__main__":

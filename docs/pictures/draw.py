@@ -38,9 +38,9 @@ from replay.rerun.scene import coarsened, deepest
 from runners.reporting.figures import (
     WIDTH,
     drawing,
-    method_styles,
     new_figure,
     positive_scale,
+    styles_of,
 )
 from runners.sessions.faults import FaultSettings, level_name, probed_mesh
 
@@ -193,7 +193,7 @@ def sequence(out: str, *named: str) -> None:
     """A row for each method, a column for each of the first, the last and two steps between."""
     files = dict(text.split("=", 1) for text in named)
     recordings = {method: read_recording(file) for method, file in files.items()}
-    styles = method_styles(list(files))
+    styles = styles_of(list(files))
     common = sorted(set.intersection(*(set(one.steps) for one in recordings.values())))
     rows = []
     for method, recording in recordings.items():

@@ -1,200 +1,207 @@
-"""The folder of an evaluation: its experiment.json, who may write, and its two tables."""
+"""The folder of an evaluation: its experiment.json, who may write, and its tables of parts."""
 
 from __future__ import annotations
 
 import json
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
 from filelock import FileLock, Timeout
 
 from chsel.errors import RecordingError, SettingError
-from chsel.problem.settings import settings_mapping
 from replay.environment import environment
-from replay.files import WritingError, whole_file
-from runners.evaluation.metrics import definition_label
+from replay.files import whole_file
 from runners.evaluation.plan import Plan
-from runners.evaluation.table import TABLES, joined_parts, write_table
-from runners.evaluation.trial_configurations import SENSORS
 
 FILE = "experiment.json"
-LOCK = ".lock"
-FORMAT = 1
-_FIXED = (
-    "format",
-    "preset",
-    "session",
-    "objects",
-    "definition",
-    "metrics",
-    "steps",
-    "starts",
-    "iterations",
-    "logs",
-    "truth",
-    "plausible",
-    "steered",
+_MAY_GROW = ("methods", "outside", "policies")
+_MAY_DIFFER = {"name", "configurations", "seeds", "commands", "environments", *_MAY_GROW}
+_OF_MACHINE = {"folder", "assets", "recordings"}  # what is none of the results
+Row = Mapping[str, Any]
+_TEXT, _COUNT, _NUMBER, _FLAG = pa.string(), pa.int64(), pa.float64(), pa.bool_()
+
+
+def _schema(*columns: tuple[pa.DataType, str]) -> pa.Schema:
+    """Columns by their type, names apart by spaces."""
+    return pa.schema([(name, kind) for kind, names in columns for name in names.split()])
+
+
+RESULTS = _schema(
+    (_TEXT, "object configuration"),
+    (_COUNT, "seed"),
+    (_TEXT, "method preset definition faults"),
+    (_COUNT, "step contacts free_points occupied_points"),
+    (_TEXT, "status"),
+    (_COUNT, "members kept local"),
+    (_NUMBER, "true_cost"),
+    (_COUNT, "hypotheses distinct"),
+    (_NUMBER, "best_cost mean_cost coverage plausibility diversity root"),
+    (_NUMBER, "position_error rotation_error rank"),
+    (_FLAG, "truth_held"),
+    (_NUMBER, "nearest_hypothesis nearest_position nearest_rotation exact_members seconds"),
+    (_TEXT, "digest problem_digest"),
 )
+"""A row a (configuration, seed, method, step). Lengths in metres, angles in radians, but coverage,
+plausibility and diversity (PD) in mm^2 and root, of PD, in mm. definition: of the plausible set.
+position_error, rotation_error: of the best hypothesis, modulo the object's symmetries, at its
+centre. nearest_hypothesis: root mean square distance of the true pose's surface from that of the
+nearest hypothesis, whose errors are nearest_position and nearest_rotation. truth_held: whether the
+true pose lies in the set that the result stands for, where a method tells. status: "ok", "failed:
+REASON" or "no plausible set: REASON"; what a row does not have is null."""
+ITERATIONS = _schema(
+    (_TEXT, "configuration"),
+    (_COUNT, "seed"),
+    (_TEXT, "method definition"),
+    (_COUNT, "step iteration filled"),
+    (_NUMBER, "best_cost mean_cost qd_score coverage plausibility diversity root"),
+)
+"""A row a (configuration, seed, method, step, iteration) of a search over an archive. Costs and
+metrics are of the hypotheses that the method would give if it ended there."""
+PROBES = _schema(
+    (_TEXT, "object configuration"),
+    (_COUNT, "seed"),
+    (_TEXT, "policy method preset faults"),
+    (_COUNT, "step probes"),
+    (_TEXT, "status"),
+    (_COUNT, "contacts free_points action"),
+    (_FLAG, "hit"),
+    (_NUMBER, "hit_forecast forecast_spread surprise seconds decision_seconds"),
+    (_COUNT, "hypotheses poses"),
+    (_NUMBER, "error belief_error spread promised"),
+    (_TEXT, "stop digest problem_digest decision_digest"),
+)
+"""A row a (configuration, seed, policy, probe). Lengths in metres, surprise in nats. probes: how
+many are done. action: index of the one that was taken, of those offered. hit: whether it met the
+object; hit_forecast, forecast_spread: the chance of it and the spread of the belief afterwards, as
+forecast. error: mean distance of the surface in a hypothesis from that in the true pose, of the
+last registration; before there is one, belief_error, the same of the belief's poses by their
+weights. poses: how many these are. spread: of the belief. promised: by how much the best action
+would narrow it. stop: why a session with the usual rules would end here, "" if it goes on."""
+TABLES = {"results": RESULTS, "iterations": ITERATIONS, "probes": PROBES}
+_ORDER = ("object", "configuration", "seed", "policy", "method", "step", "iteration")
 
 
-@contextmanager
-def writing_alone(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
-    """Keep other runs out of the folder of an evaluation; waits while one of them is at work.
+def write_part(path: Path, rows: Sequence[Row], schema: pa.Schema, source: str = "") -> None:
+    """Write a finished part of a table. source: kept with it, see `part_source`."""
+    table = pa.Table.from_pylist([dict(row) for row in rows], schema=schema)
+    with whole_file(path) as beside:
+        pa.parquet.write_table(table.replace_schema_metadata({"about": source}), beside)
 
-    The operating system lifts the lock of a process that ends. On a file system without locks
-    nobody is kept out: two runs would do the same work there, and write the same whole files.
-    say: shows a line.
-    """
-    lock = FileLock(folder / LOCK)
+
+def part_source(path: Path) -> str | None:
+    """What was kept with a part; None if there is no part."""
+    if not path.exists():
+        return None
+    return (pa.parquet.read_schema(path).metadata or {}).get(b"about", b"").decode()
+
+
+def writing_alone(folder: Path, say: Callable[[str], None]) -> AbstractContextManager[object]:
+    """Keep other runs out of the folder of an evaluation; says so and waits while one is there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / ".lock")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock.acquire(timeout=0)
+        return lock.acquire(timeout=0)
     except Timeout:
         say(f"another run is at work in {folder}; this one waits until it ends")
-        lock.acquire()
-    except NotImplementedError:
-        pass
-    except OSError as error:
-        raise WritingError(
-            f"{lock.lock_file} cannot be written ({error.strerror or error}); accepted: an out=DIR "
-            "that can be written"
-        ) from error
-    try:
-        yield
-    finally:
-        lock.release()
+        return lock.acquire()
 
 
 def collect(folder: Path) -> pa.Table:
-    """Write results and, where iterations are measured, iterations; the former.
-
-    An evaluation of policies has probes in place of both. Every part that exists is in them,
-    whoever made it and when.
-    """
+    """Write NAME.parquet and NAME.csv of each table, of all parts; gives results, or probes."""
     experiment = read_experiment(folder)
-    if experiment["policies"]:
-        return write_table(folder, "probes", gathered(folder, experiment, "probes"))
-    if experiment["iterations"]["every"] is not None:
-        write_table(folder, "iterations", gathered(folder, experiment, "iterations"))
-    return write_table(folder, "results", gathered(folder, experiment, "results"))
+    searches = ["iterations"] if experiment["every"] is not None else []
+    for name in [*searches, "probes" if experiment["policies"] else "results"]:
+        table = gathered(folder, experiment, name)
+        with whole_file(folder / f"{name}.parquet") as beside:
+            pa.parquet.write_table(table, beside)
+        with whole_file(folder / f"{name}.csv") as beside:
+            pa.csv.write_csv(table, beside)
+    return table
 
 
 def gathered(folder: Path, experiment: Mapping[str, Any], name: str) -> pa.Table:
-    """One of TABLES, of the parts that are finished."""
+    """The rows of one of TABLES, in order, of the parts that are finished."""
+    schema = TABLES[name]
     suffixes = (".iterations.parquet",) if name == "iterations" else (".parquet", ".failed.parquet")
-    parts = list(_parts(folder, experiment, *suffixes))
-    return joined_parts(parts, TABLES[name], definition_label(experiment["definition"]))
+    labels = [*experiment["policies"]] or [*experiment["methods"], *experiment["outside"]]
+    tables = [schema.empty_table()]
+    for configuration in experiment["configurations"]:
+        for seed in experiment["seeds"]:
+            trial = folder / "trials" / configuration / f"seed_{seed}"
+            for label in labels:  # the first file with one of the suffixes
+                files = [trial / f"{label}{suffix}" for suffix in suffixes]
+                for path in [file for file in files if file.exists()][:1]:
+                    part = pa.parquet.read_table(path, partitioning=None)
+                    tables.append(part.replace_schema_metadata().cast(schema))
+    order = [(key, "ascending") for key in _ORDER if key in schema.names]
+    return pa.concat_tables(tables).sort_by(order).combine_chunks()
 
 
 def join_experiment(
     plan: Plan, name: str, configurations: Sequence[str], seeds: Sequence[int]
 ) -> None:
-    """Make the folder of an evaluation, or add to what is planned in it.
+    """Make the folder of an evaluation, or add configurations, seeds and methods to it.
 
-    Configurations, seeds and methods may become more. Raises SettingError, naming what differs, if
-    the folder was made with other settings, or is not of an evaluation.
+    Raises SettingError, naming what differs, if it was made with other settings, or is another's.
     """
     path = plan.folder / FILE
     ours = _described(plan, name, configurations, seeds)
     if path.exists():
         theirs = read_experiment(plan.folder)
         _check_same(plan.folder, theirs, ours)
-        ours = _united(plan, theirs, ours)
+        ours |= {kind: {**theirs[kind], **ours[kind]} for kind in _MAY_GROW}
+        both = {*theirs["configurations"], *configurations}
+        ours["name"] = theirs["name"]
+        ours["configurations"] = [name for name in plan.configurations if name in both]
+        ours["seeds"] = sorted({*theirs["seeds"], *seeds})
+        for kind in ("commands", "environments"):
+            ours[kind] = theirs[kind] + [one for one in ours[kind] if one not in theirs[kind]]
     elif (plan.folder / "trials").exists():
         raise SettingError(f"{plan.folder} has trials but no {FILE}; accepted: another out=DIR")
-    _write(path, ours)
-
-
-def add_environments(folder: Path, environments: Iterable[Mapping[str, str]]) -> None:
-    """Note those of workers which differ from what experiment.json has."""
-    values = read_experiment(folder)
-    others = values["other_environments"]
-    new = [one for one in environments if one not in [values["environment"], *others]]
-    if new:
-        _write(folder / FILE, {**values, "other_environments": [*others, *new]})
+    with whole_file(path) as beside:
+        beside.write_text(json.dumps(ours, indent=2) + "\n")
 
 
 def read_experiment(folder: Path) -> dict[str, Any]:
     """What experiment.json says. Raises RecordingError if it is damaged or missing."""
     path = folder / FILE
     try:
-        values = json.loads(path.read_text())
+        return dict(json.loads(path.read_text()))
     except (OSError, ValueError) as error:
         raise RecordingError(
             f"{path} cannot be read ({error}); accepted: a folder that runners.evaluate has written"
         ) from None
-    return dict(values)
-
-
-def _write(path: Path, values: Mapping[str, Any]) -> None:
-    with whole_file(path) as beside:
-        beside.write_text(json.dumps(values, indent=2) + "\n")
-
-
-def _parts(folder: Path, experiment: Mapping[str, Any], *suffixes: str) -> Iterable[Path]:
-    """Of every trial and label the first file with one of the suffixes."""
-    labels = [*experiment["policies"]] or [*experiment["methods"], *experiment["outside"]]
-    for configuration in experiment["configurations"]:
-        for seed in experiment["seeds"]:
-            trial = folder / "trials" / configuration / f"seed_{seed}"
-            for label in labels:
-                files = (trial / f"{label}{suffix}" for suffix in suffixes)
-                yield from [file for file in files if file.exists()][:1]
 
 
 def _described(
     plan: Plan, name: str, configurations: Sequence[str], seeds: Sequence[int]
 ) -> dict[str, Any]:
-    values = {
-        "format": FORMAT,
-        "name": name,
-        "preset": plan.preset,
-        "configurations": list(configurations),
-        "seeds": list(seeds),
-        "methods": {label: one.config for label, one in plan.contenders.items()},
-        "outside": {label: str(folder) for label, folder in plan.outside.items()},
-        "session": dict(plan.session),
-        "objects": plan.objects,
-        "definition": dict(plan.definition),
-        "metrics": settings_mapping(plan.metrics),
-        "steps": plan.steps,
-        "starts": plan.starts,
-        "iterations": {"every": plan.every},
-        "logs": None if plan.logs is None else str(plan.logs),
-        "truth": settings_mapping(plan.truth) if plan.kind == SENSORS else None,
-        "plausible": plan.plausible,
-        "policies": {label: one.config for label, one in plan.policies.items()},
-        "steered": bool(plan.policies),
-        "commands": [_command()],
-        "environment": environment(),
-        "other_environments": [],
-    }
-    return json.loads(json.dumps(values))  # as it will be read: lists for tuples
-
-
-def _command() -> str:
-    """The command line that this process was started with, its interpreter left out."""
-    name = getattr(getattr(sys.modules.get("__main__"), "__spec__", None), "name", None)
-    program = f"python -m {name}" if name else Path(sys.argv[0]).name
-    return " ".join([program, *(shlex.quote(argument) for argument in sys.argv[1:])])
+    main = getattr(sys.modules.get("__main__"), "__spec__", None)
+    program = ["python", "-m", main.name] if main else [Path(sys.argv[0]).name]
+    values = {key: value for key, value in asdict(plan).items() if key not in _OF_MACHINE}
+    values |= {"methods": values.pop("contenders"), "steered": bool(plan.policies)}
+    values |= {"name": name, "configurations": list(configurations), "seeds": list(seeds)}
+    values |= {"commands": [shlex.join([*program, *sys.argv[1:]])], "environments": [environment()]}
+    return dict(json.loads(json.dumps(values, default=str)))  # as it will be read
 
 
 def _check_same(folder: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
     """Raise SettingError where what may not become more differs."""
 
     def fixed(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
-        found = {key: values.get(key) for key in _FIXED}
-        if ours["steered"]:
-            found["methods"] = list(values["methods"])
+        found = {key: value for key, value in values.items() if key not in _MAY_DIFFER}
         for kind in ("methods", "policies"):
-            shared = {label: one for label, one in values[kind].items() if label in others[kind]}
-            found |= {f"{kind}.{label}": one for label, one in shared.items()}
-        return dict(flattened(found))
+            found[kind] = {key: one for key, one in values[kind].items() if key in others[kind]}
+        return flat(found) | ({"methods": list(values["methods"])} if ours["steered"] else {})
 
     before, now = fixed(theirs, ours), fixed(ours, theirs)
     differing = [
@@ -203,32 +210,12 @@ def _check_same(folder: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]
         if now.get(path) != before.get(path)
     ]
     if differing:
-        more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise SettingError(
-            f"{folder} was made with other settings: {'; '.join(differing[:3])}{more}; accepted: "
-            "the same ones, or another out=DIR"
+            f"{folder} was made with other settings: {'; '.join(differing[:3])}; accepted: the "
+            "same ones, or another out=DIR"
         )
 
 
-def flattened(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+def flat(values: Mapping[str, Any]) -> dict[str, Any]:
     """Nested values by their paths."""
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from flattened(value, f"{path}{name}.")
-        else:
-            yield f"{path}{name}", value
-
-
-def _united(plan: Plan, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> dict[str, Any]:
-    both = {*theirs["configurations"], *ours["configurations"]}
-    known, here = [theirs["environment"], *theirs["other_environments"]], ours["environment"]
-    return {
-        **ours,
-        "name": theirs["name"],
-        "configurations": [name for name in plan.configurations if name in both],
-        "seeds": sorted({*theirs["seeds"], *ours["seeds"]}),
-        **{kind: {**theirs[kind], **ours[kind]} for kind in ("methods", "outside", "policies")},
-        "commands": list(dict.fromkeys([*theirs["commands"], *ours["commands"]])),
-        "environment": known[0],
-        "other_environments": known[1:] + [here] * (here not in known),
-    }
+    return dict(pd.json_normalize(values).to_dict("records")[0])

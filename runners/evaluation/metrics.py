@@ -23,11 +23,7 @@ _COMBINED = {"sums": "sums over points (the paper's)", "means": "means over poin
 
 
 def definition_settings(definition: Mapping[str, Any], epsilon: float | None) -> PlausibleSettings:
-    """The settings of a choice `definition` of a command, checked.
-
-    definition: plain values with a name. epsilon: metres, that of the object, for a definition
-    that has none of its own.
-    """
+    """The settings of a choice `definition`, checked; epsilon, metres, where it has none."""
     values = {key: value for key, value in definition.items() if key != "name"}
     if values.get("epsilon") is None:
         values["epsilon"] = epsilon
@@ -37,8 +33,7 @@ def definition_settings(definition: Mapping[str, Any], epsilon: float | None) ->
 def definition_label(definition: Mapping[str, Any]) -> str:
     """The name of a definition as tables have it: two that differ never have the same one.
 
-    A definition whose settings were changed is the name of the one it was, "~", and the start of
-    the digest of its settings.
+    Where settings were changed, the name of the one it was, "~", and the start of their digest.
     """
     settings = definition_settings(definition, 1.0)
     name = definition_name(settings)
@@ -49,8 +44,7 @@ def definition_label(definition: Mapping[str, Any]) -> str:
 
 def definition_text(definition: Mapping[str, Any]) -> str:
     """The label of a definition, and which poses are members by it."""
-    cost = definition_settings(definition, 1.0).cost
-    epsilon = definition.get("epsilon")
+    cost, epsilon = definition_settings(definition, 1.0).cost, definition.get("epsilon")
     bound = "that of each object" if epsilon is None else f"{1000.0 * epsilon:g} mm"
     return (
         f"{definition_label(definition)}, cost by {_COMBINED[cost.combine]}, free points at most "
@@ -66,7 +60,7 @@ class MetricsConfig(DistanceSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        cheapest(np.zeros(1), self.quantile)
+        cheapest(np.zeros(1), self.quantile)  # which checks it
 
 
 store("metrics", "default", settings_mapping(MetricsConfig()))
@@ -90,32 +84,20 @@ class HypothesisMetrics:
         *,
         ranked: bool = True,
     ) -> dict[str, float]:
-        """Coverage, plausibility and diversity in mm^2, its root, and the rank of the truth.
-
-        ranked: False leaves the rank out, which takes distances of its own.
-        """
+        """Coverage, plausibility and diversity in mm^2, its root, and if wanted the rank."""
         if found is None or len(found.cost) == 0:
             return {}
         distance = self._surface_distance(problem)
         chosen = found.object_from_world[cheapest(found.cost, self._config.quantile)]
-        distances = distance.between(chosen, members.world_from_object)
-        metrics = plausible_diversity(distances)
-        row: dict[str, float] = {
-            "distinct": found.distinct,
-            "coverage": metrics.coverage,
-            "plausibility": metrics.plausibility,
-            "diversity": metrics.diversity,
-            "root": metrics.root,
-        }
+        metrics = plausible_diversity(distance.between(chosen, members.world_from_object))
+        names = ("coverage", "plausibility", "diversity", "root")
+        row = {"distinct": found.distinct, **{name: getattr(metrics, name) for name in names}}
         if ranked and len(chosen) > 1:
             row["rank"] = true_pose_rank(distance, chosen, self._truth)
         return row
 
     def nearest(self, problem: RegistrationProblem, found: Hypotheses) -> tuple[int, float]:
-        """Index of the hypothesis nearest to the true pose, and how far from it its surface is.
-
-        Root mean square distance in metres, which no symmetry of the object changes.
-        """
+        """Index of the hypothesis nearest to the truth, and the RMS distance of surfaces, m."""
         distance = self._surface_distance(problem)
         squares = distance.between(found.object_from_world, self._truth[None])[:, 0]  # (B,), mm^2
         nearest = int(np.argmin(squares))

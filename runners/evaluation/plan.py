@@ -8,8 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-
 from chsel.errors import require_choice
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
@@ -17,9 +15,8 @@ from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.problem.settings import build_settings
 from replay.arguments import chosen_steps
-from runners.evaluation.contenders import Contender, PolicyContender
+from runners.evaluation.contenders import Contender
 from runners.evaluation.metrics import MetricsConfig, definition_label, definition_settings
-from runners.evaluation.table import PROBES, RESULTS
 from runners.evaluation.trial_configurations import (
     MOST_PROBES,
     SENSORS,
@@ -27,7 +24,6 @@ from runners.evaluation.trial_configurations import (
     configurations_of,
     object_values,
     recorded_object,
-    with_faults,
 )
 from runners.objects.loader import ObjectConfig
 from runners.sessions import session_settings
@@ -35,25 +31,22 @@ from runners.sessions.faults import CLEAN, LEVELS, level_name
 
 SESSIONS = ("simulated", "kinematic", SENSORS)
 OWN = "own"
-OUTSIDE = "outside"
-"""What the table has for a preset of hypothesis sets from elsewhere."""
-OBJECTS = {"models": "", "scans": "ycb/"}
-"""Of the names of objects, by what `objects` says they are."""
+OBJECTS = {"models": "", "scans": "ycb/"}  # before the names of objects, by what they are
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
     """All that determines the results, and where they go."""
 
-    folder: Path  # of the evaluation
+    folder: Path
     preset: str
     session: Mapping[str, Any]  # settings, with kind
     objects: str  # "models" or "scans"
     definition: Mapping[str, Any]  # of the plausible sets, epsilon None for that of the object
     metrics: MetricsConfig
     steps: str | None
-    # OWN, where E_0 and E_l of a step follow from each method's own results (CHSEL, Alg. 2), or the
-    # method from whose results they follow, so that all register the same problems.
+    # OWN, where E_0 and E_l follow from each method's own results (CHSEL, Alg. 2), or the method
+    # from whose results they follow, so that all register the same problems.
     starts: str
     every: int | None  # iterations between measures of the search; None: at its end alone
     recordings: bool  # whether to write METHOD.mcap
@@ -65,35 +58,25 @@ class Plan:
     truth: TruePoseSettings = field(default_factory=TruePoseSettings)  # how it is sought in these
     plausible: bool = True  # whether to make plausible sets; without them there is no PD
     # By label; each probes in sessions of its own, registered by the only contender.
-    policies: Mapping[str, PolicyContender] = field(default_factory=dict)
+    policies: Mapping[str, Contender] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        require_choice("session", self.kind, SESSIONS)
 
     @property
     def kind(self) -> str:
-        """Of the sessions. Raises SettingError for one that evaluations cannot have."""
-        kind = str(self.session.get("kind"))
-        require_choice("session", kind, SESSIONS)
-        return kind
+        """Of the sessions."""
+        return str(self.session.get("kind"))
 
     @cached_property
     def configurations(self) -> dict[str, TrialConfiguration]:
         """All that there are, by name."""
-        found = configurations_of(self.kind, self.logs)
-        return found if self.kind == SENSORS else with_faults(found)
+        return configurations_of(self.kind, self.logs)
 
     @property
     def labels(self) -> list[str]:
         """What a trial has a part of the table of: policies, or methods and external results."""
         return [*self.policies] or [*self.contenders, *self.outside]
-
-    @property
-    def schema(self) -> pa.Schema:
-        """The columns of such a part."""
-        return PROBES if self.policies else RESULTS
-
-    @property
-    def log_folder(self) -> Path:
-        """Where CONFIGURATION/seed_K.mcap are, in sessions of sensors."""
-        return self.logs if self.logs is not None else self.folder / "logs"
 
     def about(self, trial: Trial, label: str) -> dict[str, Any]:
         """What all rows of a label in a trial share."""
@@ -106,8 +89,9 @@ class Plan:
         if self.policies:
             (contender,) = self.contenders.values()
             return row | {"policy": label, "method": contender.label, "preset": contender.preset}
-        preset = self.contenders[label].preset if label in self.contenders else OUTSIDE
-        return row | {"method": label, "preset": preset, "definition": self.definition_label}
+        preset = self.contenders[label].preset if label in self.contenders else "outside"
+        definition = definition_label(self.definition)
+        return row | {"method": label, "preset": preset, "definition": definition}
 
     def leader(self) -> Method | None:
         """The method whose problems all methods get, if these are not their own."""
@@ -117,7 +101,6 @@ class Plan:
 
     def object_config(self, configuration: str) -> ObjectConfig:
         """The object of a configuration; at its real size in sessions of sensors."""
-        require_choice("objects", self.objects, OBJECTS)
         of = self.configurations[configuration]
         if of.log_folder is not None:
             return recorded_object(of)
@@ -137,24 +120,16 @@ class Plan:
 
     def session_settings(self, trial: Trial) -> Any:
         """The same, checked."""
-        config = self.session_config(trial)
-        config.pop("kind")
-        return session_settings(self.kind, config)
+        values = self.session_config(trial)
+        return session_settings(values.pop("kind"), values)
 
     def faults(self, trial: Trial) -> str:
         """The name of the level of faults in a trial's session."""
-        if self.kind == SENSORS:
-            return CLEAN
-        return level_name(self.session_settings(trial).faults)
+        return level_name(getattr(self.session_settings(trial), "faults", LEVELS[CLEAN]))
 
     def plausible_settings(self, epsilon: float) -> PlausibleSettings:
         """The definition of the plausible sets of an object of this epsilon, metres."""
         return definition_settings(self.definition, epsilon)
-
-    @cached_property
-    def definition_label(self) -> str:
-        """The name of that definition in tables."""
-        return definition_label(self.definition)
 
     def probes_of(self, configuration: str) -> range:
         """The indices that probes of a configuration may have."""
@@ -187,30 +162,24 @@ class Trial:
 
     def log(self, plan: Plan) -> Path:
         """Its raw log, in sessions of sensors: a rosbag2 folder, or else an .mcap file."""
-        folder = plan.log_folder / self.configuration
+        folder = (plan.logs or plan.folder / "logs") / self.configuration
         bag = folder / f"seed_{self.seed}"
         return bag if bag.is_dir() else folder / f"seed_{self.seed}.mcap"
 
 
 @dataclass(frozen=True, order=True)
 class Task:
-    """What one worker does at a time: the session of a trial, or a label's rows about it.
-
-    label: of a contender, or of external results; "" for the session and its plausible sets.
-    """
+    """What one worker does at a time: the session of a trial, or a label's rows about it."""
 
     trial: Trial
-    label: str = ""
+    label: str = ""  # of a contender or external results; "" for session and plausible sets
 
     def __str__(self) -> str:
         what = self.label or "session"
         return f"{self.trial.configuration}, seed {self.trial.seed}: {what}"
 
     def sessions(self, plan: Plan) -> tuple[Trial, ...]:
-        """The trials whose sessions the rows of the label need; with faults also that without.
-
-        A policy needs none: it makes a session of its own.
-        """
+        """The trials whose sessions are needed, with faults that without, too; of policies none."""
         if plan.policies:
             return ()
         clean = self.trial.without_faults(plan) if plan.plausible else self.trial

@@ -1,88 +1,93 @@
-"""A method on the session of a trial: its registrations, recorded, and a row about each."""
+"""The rows of a trial: of a method's registrations, recorded, or of sets made elsewhere."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from chsel.errors import EvaluationError
-from chsel.methods.method import Method
+import numpy as np
+
+from chsel.errors import ChselError
+from chsel.numerics.arrays import frozen
 from chsel.plausible.evaluation_cost import EvaluationCost
-from chsel.plausible.plausible_set import PlausibleSet
+from chsel.plausible.plausible_set import PlausibleSet, load_plausible
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import object_symmetry
-from chsel.problem.poses import inverse
+from chsel.problem.file_checks import read_npz
+from chsel.problem.poses import Poses, check_rigid, inverse
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.search_space import search_space
 from chsel.problem.streams import Purpose, StreamKey
-from chsel.qd.selection import ranked, select_elites
+from chsel.qd.selection import ranked, repeated, select_elites
 from chsel.rehearsal import warm_up
 from replay.environment import environment
-from replay.events import Logged, SessionEnded, SessionStarted
 from replay.files import file_digest
-from runners.evaluation.contenders import Contender, repeat_seed
+from runners.evaluation.contenders import MOST_REPEATS, Contender, repeat_label, repeat_seed
+from runners.evaluation.experiment import ITERATIONS, Row, write_part
 from runners.evaluation.metrics import HypothesisMetrics
-from runners.evaluation.plan import OWN, Plan, Trial
-from runners.evaluation.table import ITERATIONS, RESULTS, Row, write_part
+from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.trial_session import (
     StepRecorder,
-    load_members,
     open_recorded,
     plausible_settings_of,
     problems,
-    read_session,
-    recording_in,
+    read_told,
 )
 from runners.run.recording import RecordingConfig
-from runners.run.session_run import SessionRun, one_line
+from runners.run.session_run import SessionRun
 from runners.sessions.recorded import RecordedSession
+
+REPEAT_FOLDER = "draw_{}"
+"""Where further sets of the same sessions are, in the folder of the first ones."""
+_TOLERANCE = 1e-5  # of rotations: transforms may have been written as text
+_SHAPES: dict[str, Any] = {"step": (None, 4, 4), "cost": (None,), "seconds": ()}
+_KEY = re.compile(r"(step|cost|seconds)_(\d{1,10})")
+_NAMES = "accepted: step_K, cost_K and seconds_K"
 
 
 class ResultRows:
     """Makes rows of the table of what was found at the steps of a trial."""
 
     def __init__(
-        self,
-        plan: Plan,
-        trial: Trial,
-        session: RecordedSession,
-        label: str,
-        method: Method | None = None,
+        self, plan: Plan, trial: Trial, session: RecordedSession, label: str, holds: Any = None
     ) -> None:
-        """method: that made the hypotheses; one with `holds` tells whether its set has the truth.
+        """A session with faults is measured by the plausible sets of the same probes without any.
 
-        A session with faults is measured by the plausible sets of the same probes without any.
+        holds: of the method that made the hypotheses, tells whether its set has the truth.
         """
         assert session.world_from_object is not None
-        self._plan, self._trial, self._session = plan, trial, session
-        self._about, self._holds = plan.about(trial, label), getattr(method, "holds", None)
+        self._plan, self._trial = plan, trial
+        self._about, self._holds = plan.about(trial, label), holds
         self._clean = trial.without_faults(plan)
         self._clean_problems: dict[int, RegistrationProblem] | None = None
         if self._clean != trial and plan.plausible:
-            self._session = open_recorded(plan, self._clean)
-            of_clean = problems(plan, self._clean, self._session)
+            of_clean = problems(plan, self._clean, open_recorded(plan, self._clean))
             self._clean_problems = {problem.key.step: problem for problem in of_clean}
-        self._told = read_session(plan, self._clean) if plan.plausible else None
+        self._missing: dict[str, str] = {}  # why steps have no plausible set
+        if plan.plausible:
+            self._missing = read_told(self._clean.folder(plan))["no_plausible_set"]
         self._settings = plausible_settings_of(plan, session)
-        mesh, truth = session.recorded.mesh, session.world_from_object
-        self._metrics, self._truth = HypothesisMetrics(plan.metrics, mesh, truth), truth
+        mesh, self._truth = session.recorded.mesh, session.world_from_object
+        self._metrics = HypothesisMetrics(plan.metrics, mesh, self._truth)
         self._symmetry = object_symmetry(mesh)
 
     def members(self, problem: RegistrationProblem) -> tuple[PlausibleSet | None, str]:
         """The plausible set of a problem; else why there is none, "" where none is wanted."""
-        if self._told is None:
-            return None, ""
         step = problem.key.step
+        if not self._plan.plausible:
+            return None, ""
         if self._clean_problems is not None and step not in self._clean_problems:
             return None, f"without faults there is no registration at step {step}"
-        if step in self._told.failures:
-            return None, self._told.failures[step]
-        of_session = self._of_session(problem)
-        try:
-            return load_members(self._plan, self._clean, self._session, of_session), ""
-        except EvaluationError as error:
-            return None, one_line(error).replace(f"{self._plan.folder}/", "")
+        if str(step) in self._missing:
+            return None, self._missing[str(step)]
+        folder, of_session = self._clean.folder(self._plan), self._of_session(problem)
+        truth = {"world_from_object": self._truth}
+        found = load_plausible(folder / "plausible", of_session, self._settings, **truth)
+        return found, "" if found else f"no file in {folder.name}/plausible; remove session.json"
 
     def row(
         self, problem: RegistrationProblem, found: Hypotheses | None, failure: str = ""
@@ -107,37 +112,18 @@ class ResultRows:
             }
         if found is None:
             return row | {"status": f"failed: {failure}"}
-        row |= self._numbers(problem, found)
-        if members is None:
-            return row
-        of_session, limit = self._of_session(problem), members.true_cost + self._settings.epsilon
-        cost = EvaluationCost(of_session, self._settings.cost)
-        below = cost.evaluate(found.object_from_world, limit=limit) < limit
-        exact = {"exact_members": float(below.mean())} if len(below) else {}
-        return row | self._metrics.compute(of_session, members, found) | exact
-
-    def _of_session(self, problem: RegistrationProblem) -> RegistrationProblem:
-        """The problem without faults, with the same random numbers for all draws."""
-        if self._clean_problems is not None:
-            problem = self._clean_problems.get(problem.key.step, problem)
-        return replace(problem, key=StreamKey(self._trial.seed, problem.key.step))
-
-    def _numbers(self, problem: RegistrationProblem, found: Hypotheses) -> dict[str, Any]:
-        """What hypotheses tell without a plausible set."""
-        row: dict[str, Any] = {
+        row |= {
             "hypotheses": len(found.cost),
             "distinct": found.distinct,
             "digest": found.digest,
         }
         if len(found.cost) == 0:
             return row
-        nearest, distance = self._metrics.nearest(self._of_session(problem), found)
+        of_session = self._of_session(problem)
+        nearest, distance = self._metrics.nearest(of_session, found)
         chosen = found.object_from_world[[0, nearest]]
         position, rotation = pose_errors(chosen, self._truth, self._symmetry)
-        if self._holds is not None:
-            held = self._holds(problem, found, inverse(self._truth[None]))
-            row["truth_held"] = bool(held[0])
-        return row | {
+        row |= {
             "best_cost": float(found.cost[0]),
             "mean_cost": float(found.cost.mean()),
             "position_error": float(position[0]),
@@ -146,6 +132,21 @@ class ResultRows:
             "nearest_position": float(position[1]),
             "nearest_rotation": float(rotation[1]),
         }
+        if self._holds is not None:
+            row["truth_held"] = bool(self._holds(problem, found, inverse(self._truth[None]))[0])
+        if members is None:
+            return row
+        limit = members.true_cost + self._settings.epsilon
+        cost = EvaluationCost(of_session, self._settings.cost)
+        below = cost.evaluate(found.object_from_world, limit=limit) < limit
+        row["exact_members"] = float(below.mean())
+        return row | self._metrics.compute(of_session, members, found)
+
+    def _of_session(self, problem: RegistrationProblem) -> RegistrationProblem:
+        """The problem without faults, with the same random numbers for all draws."""
+        if self._clean_problems is not None:
+            problem = self._clean_problems.get(problem.key.step, problem)
+        return replace(problem, key=StreamKey(self._trial.seed, problem.key.step))
 
     def iterations(
         self, problem: RegistrationProblem, snapshots: Sequence[ArchiveSnapshot], settings: Any
@@ -172,10 +173,7 @@ class ResultRows:
 def hypotheses_of(
     snapshot: ArchiveSnapshot, problem: RegistrationProblem, settings: Any
 ) -> Hypotheses:
-    """The cells with the |E_0| lowest costs, chosen as the method with these settings does.
-
-    settings: with `output` and `plane`, as every method that keeps an archive has them.
-    """
+    """The cells with the |E_0| lowest costs, chosen as the method with these settings does."""
     space = search_space(settings.plane, problem.sdf)
     stream = problem.key.stream(Purpose.RESAMPLE, snapshot.refinement)
     costs, poses = -snapshot.objectives, space.poses(snapshot.solutions)
@@ -183,32 +181,29 @@ def hypotheses_of(
     return ranked(poses[chosen].matrices, costs[chosen], snapshot.cells[chosen], poses.matrices)
 
 
-def run_method(plan: Plan, trial: Trial, contender: Contender) -> None:
-    """Write METHOD.mcap, if recordings are wanted, and then the method's part of the table."""
-    warm_up(contender.method())  # so that no time holds the loading of compiled kernels
-    folder, iterations = trial.folder(plan), list[Row]()
-    file = folder / f"{contender.label}.mcap" if plan.recordings else None
-    with recording_in(file) as recorder:
-        rows = _rows(plan, trial, contender, recorder, iterations)
-    if plan.every is not None:
-        write_part(folder / f"{contender.label}.iterations.parquet", iterations, ITERATIONS)
-    write_part(folder / f"{contender.label}.parquet", rows, RESULTS)
-
-
-def _rows(
-    plan: Plan, trial: Trial, contender: Contender, recorder: StepRecorder, iterations: list[Row]
+def method_rows(
+    plan: Plan, trial: Trial, contender: Contender, recorder: StepRecorder
 ) -> list[Row]:
-    """A row for every registration. iterations: gets those of the searches, where wanted."""
+    """A row for every registration; those of searches, where wanted, become a part of a table."""
     session, chosen = open_recorded(plan, trial), plan.steps_of(trial.configuration)
     method, leader = contender.method(), plan.leader()
-    recorder.record(_started(plan, trial, contender, session))
+    warm_up(method)  # so that no time holds the loading of compiled kernels
+    config = {"name": contender.name, **contender.settings}
+    started = replace(
+        session.recorded,
+        runner="evaluate",
+        method=contender.name,
+        config={**session.recorded.config, "method": config, "preset": {"name": contender.preset}},
+        environment=environment(),
+        # Problems of another method do not follow from the results of this one.
+        source="" if leader is None else file_digest(trial.folder(plan) / "session.mcap"),
+    )
+    recorder.record(started)
+    only = chosen if leader is None else None
+    online = (leader or method).online
     run = SessionRun(
         session,
-        session.online(
-            (leader or method).online,
-            repeat_seed(trial.seed, contender.draw),
-            only=chosen if leader is None else None,
-        ),
+        session.online(online, repeat_seed(trial.seed, contender.draw), only=only),
         method,
         recorder,
         symmetry=object_symmetry(session.recorded.mesh),
@@ -227,8 +222,9 @@ def _rows(
         return leader.register(problem)
 
     steps = run.steps(catch=Exception) if leader is None else run.steps(register_and_lead)
-    result_rows = ResultRows(plan, trial, session, contender.label, method)
-    rows: list[Row] = []
+    holds = getattr(method, "holds", None)
+    result_rows = ResultRows(plan, trial, session, contender.label, holds)
+    rows, iterations = list[Row](), list[Row]()
     for step, _ in steps:
         problem = step.problem
         if problem is None or step.step not in chosen:
@@ -240,26 +236,101 @@ def _rows(
         rows.append(row | {"seconds": run.registered.total_seconds})
         if plan.every is not None:
             iterations += result_rows.iterations(problem, recorder.snapshots, method.settings)
-    recorder.record(Logged(run.step, "info", "session finished"))
-    recorder.record(SessionEnded(run.step, "finished"))
+    if plan.every is not None:
+        path = trial.folder(plan) / f"{contender.label}.iterations.parquet"
+        write_part(path, iterations, ITERATIONS)
     return rows
 
 
-def _started(
-    plan: Plan, trial: Trial, contender: Contender, session: RecordedSession
-) -> SessionStarted:
-    of = session.recorded
-    # Problems of another method do not follow from the results of this one.
-    source = "" if plan.starts == OWN else file_digest(trial.folder(plan) / "session.mcap")
-    return replace(
-        of,
-        runner="evaluate",
-        method=contender.name,
-        config={
-            **of.config,
-            "method": {"name": contender.name, **contender.settings},
-            "preset": {"name": contender.preset},
-        },
-        environment=environment(),
-        source=source,
-    )
+class ExternalSetError(ChselError):
+    """A file of hypothesis sets from elsewhere cannot be used."""
+
+
+def external_folders(given: Mapping[str, Path]) -> dict[str, Path]:
+    """Folders by label: those given, and under a label of its own every draw in them."""
+    found = dict(given)
+    for label, folder in given.items():
+        for draw in range(1, MOST_REPEATS):
+            of_draw = folder / REPEAT_FOLDER.format(draw)
+            if not of_draw.is_dir():
+                break
+            found.setdefault(repeat_label(label, draw), of_draw)
+    return found
+
+
+def external_file(plan: Plan, trial: Trial, label: str) -> Path:
+    """FOLDER/CONFIGURATION/seed_S.npz, or .json if there is that alone."""
+    path = plan.outside[label] / trial.configuration / f"seed_{trial.seed}.npz"
+    text = path.with_suffix(".json")
+    return text if text.is_file() and not path.is_file() else path
+
+
+def external_digest(plan: Plan, trial: Trial, label: str) -> str:
+    """Digest of the file of a trial; "none" without one."""
+    path = external_file(plan, trial, label)
+    return file_digest(path) if path.is_file() else "none"
+
+
+def read_external(plan: Plan, trial: Trial, label: str) -> dict[int, dict[str, Any]]:
+    """The sets of a trial in the folder of a label, by step; none without a file.
+
+    npz: arrays `step_K` (B, 4, 4), world_from_object of step K, best first; where known `cost_K`
+    (B,) and `seconds_K`. json: the same as lists. Given as "step", "cost" and "seconds". Raises
+    ExternalSetError for other names, steps that do not exist, shapes, numbers and rotations.
+    """
+    path = external_file(plan, trial, label)
+    if not path.is_file():
+        return {}
+    try:
+        json_file = path.suffix == ".json"
+        values = json.loads(path.read_text()) if json_file else read_npz(path, error=ChselError)
+    except (OSError, ValueError, ChselError) as error:
+        reason = " ".join(str(error).split())
+        raise ExternalSetError(f"{path} cannot be read ({reason})") from None
+    if not isinstance(values, Mapping):
+        raise ExternalSetError(f"{path} is no object; {_NAMES}")
+    steps = plan.probes_of(trial.configuration)
+    sets: dict[int, dict[str, Any]] = {}
+    for key, value in values.items():
+        match = _KEY.fullmatch(key)
+        if match is None:
+            raise ExternalSetError(f"{path} has {key!r}; {_NAMES}")
+        step = int(match[2])
+        if step not in steps:
+            raise ExternalSetError(
+                f"{path} has {key}; accepted: steps 0 to {steps[-1]} of {trial.configuration}"
+            )
+        array = frozen(f"{path}: {key}", value, _SHAPES[match[1]], error=ExternalSetError)
+        sets.setdefault(step, {})[match[1]] = array
+    for step, found in sets.items():
+        name, poses = f"{path}: step_{step}", found.get("step", ())
+        if len(poses) == 0:
+            raise ExternalSetError(f"{name} is empty; accepted: at least one transform")
+        check_rigid(name, poses, _TOLERANCE)
+        if len(found.get("cost", poses)) != len(poses):
+            raise ExternalSetError(f"{path}: cost_{step} is not as long as step_{step}")
+    return sets
+
+
+def external_rows(plan: Plan, trial: Trial, label: str) -> list[Row]:
+    """The rows of the table about external results, of one trial."""
+    sets, path = read_external(plan, trial, label), external_file(plan, trial, label)
+    missing = f"{path} has no set of this step" if path.is_file() else f"there is no {path}"
+    session = open_recorded(plan, trial)
+    result_rows = ResultRows(plan, trial, session, label)
+    rows: list[Row] = []
+    for problem in problems(plan, trial, session):
+        given = sets.get(problem.key.step)
+        if given is None:
+            row = result_rows.row(problem, None, missing)
+        else:
+            cost = given.get("cost", np.zeros(len(given["step"])))
+            order = np.argsort(cost, kind="stable")
+            poses, cells = inverse(given["step"])[order], np.full(len(cost), -1, dtype=np.int64)
+            found = Hypotheses(poses, cost[order], repeated(Poses.of(poses)), cells, poses)
+            row = result_rows.row(problem, found)
+            row["seconds"] = float(given["seconds"]) if "seconds" in given else None
+            if "cost" not in given:
+                row |= {"best_cost": None, "mean_cost": None}
+        rows.append(row | {"problem_digest": None})  # a problem has an E_0, which is not known
+    return rows

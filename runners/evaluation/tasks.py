@@ -1,116 +1,171 @@
-"""The tasks of an evaluation: sessions and what is registered on them, each done by some worker."""
+"""The tasks of an evaluation, sessions and what is registered on them, done by Dask's workers."""
 
 from __future__ import annotations
 
+import logging
 import signal
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+import socket
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from chsel.errors import ChselError, RecordingError
+from chsel.errors import ChselError, SettingError
 from chsel.numerics.threads import threads
-from replay.environment import environment
-from runners.evaluation.external_results import external_digest, external_rows
+from runners.evaluation.experiment import PROBES, RESULTS, part_source, write_part
 from runners.evaluation.plan import Plan, Task, Trial
-from runners.evaluation.run_method import run_method
-from runners.evaluation.run_policy import run_policy
-from runners.evaluation.table import Row, part_source, write_part
-from runners.evaluation.trial_session import make_session, read_session
+from runners.evaluation.run_method import external_digest, external_rows, method_rows
+from runners.evaluation.run_policy import policy_rows
+from runners.evaluation.trial_session import make_session, read_told, recording_in
 from runners.run.session_run import one_line
 
 if TYPE_CHECKING:
     from distributed import Client, Future
 
+_DASK = {
+    "distributed.scheduler.allowed-failures": 1,  # the second worker that a task kills is the last
+    "distributed.scheduler.worker-ttl": None,  # a long task may keep a worker from answering
+}
 
-@dataclass(frozen=True)
-class Ended:
-    """A task that is done, or has failed."""
 
-    task: Task
-    failure: str = ""
-    environment: Mapping[str, str] = field(default_factory=dict)  # of its worker
+@contextmanager
+def connected(scheduler: str | None, workers: int | None) -> Iterator[tuple[Client, int]]:
+    """A client of a Dask cluster, and how many workers it has.
+
+    scheduler: the address of one that runs; None for workers of our own, processes of one thread
+    on this machine, that end with the context: so many, or one a core; "slurm" for so many jobs of
+    one core, of which all else stands in dask-jobqueue's own configuration.
+    """
+    import dask
+    from dask.system import CPU_COUNT
+    from distributed import Client, LocalCluster
+    from distributed.comm import get_address_host_port
+
+    with dask.config.set(_DASK):
+        if scheduler in (None, "slurm"):
+            size = workers or (CPU_COUNT if scheduler is None else 1)
+            own = (
+                _jobs(size)
+                if scheduler
+                else LocalCluster(
+                    n_workers=size,
+                    threads_per_worker=1,
+                    memory_limit=0,
+                    host="127.0.0.1",
+                    security=True,  # TLS with keys of this run: others can reach the ports
+                    scheduler_kwargs={"dashboard_address": "127.0.0.1:0", "dashboard": False},
+                    silence_logs=logging.CRITICAL,
+                    preload=["runners.evaluation.tasks"],
+                    env={"NUMBA_NUM_THREADS": "1"},  # Dask sets those of OpenMP, MKL and OpenBLAS
+                )
+            )
+            with own as cluster, Client(cluster) as client:
+                yield client, size
+            return
+        try:  # Dask's client would try for long, and wait for a minute when it is given up
+            socket.create_connection(get_address_host_port(scheduler), timeout=30.0).close()
+            client = Client(scheduler, timeout=30.0)
+        except (OSError, ValueError) as error:
+            raise SettingError(
+                f"scheduler is {scheduler} ({' '.join(str(error).split())}); accepted: the "
+                "address of a running Dask scheduler, such as tcp://127.0.0.1:8786"
+            ) from error
+        with client:
+            yield client, checked_size(client)
+
+
+def _jobs(count: int) -> Any:
+    """A cluster of SLURM with so many jobs; another one starts in place of one that is lost."""
+    import dask
+
+    try:
+        from dask_jobqueue import SLURMCluster
+    except ModuleNotFoundError as error:
+        needed = "scheduler=slurm needs dask-jobqueue: pip install -e '.[slurm]'"
+        raise SettingError(needed) from error
+    cluster = SLURMCluster(
+        cores=1,
+        processes=1,
+        memory=dask.config.get("jobqueue.slurm.memory", None) or "4GB",
+        job_script_prologue=["export NUMBA_NUM_THREADS=1"],
+        worker_extra_args=["--preload", "runners.evaluation.tasks"],
+    )
+    cluster.adapt(minimum_jobs=count, maximum_jobs=count)
+    return cluster
+
+
+def checked_size(client: Client) -> int:
+    """How many workers a running cluster has. Raises SettingError if one has several threads."""
+    of_workers = client.nthreads().values()
+    if max(of_workers, default=1) > 1:
+        raise SettingError(
+            f"a worker has {max(of_workers)} threads; accepted: one, as of `dask worker "
+            "--nthreads 1 --nworkers NUMBER`"
+        )
+    return max(1, len(of_workers))
 
 
 def tasks_of(plan: Plan, trials: Sequence[Trial]) -> list[Task]:
     """All tasks of trials, seed by seed, those without a label, which others need, first."""
     labelled = [Task(trial, label) for trial in trials for label in plan.labels]
-    sessions = [Task(session) for task in labelled for session in task.sessions(plan)]
-    return sorted(
-        {*sessions, *labelled}, key=lambda task: (task.trial.seed, bool(task.label), task)
-    )
+    sessions = {Task(session) for task in labelled for session in task.sessions(plan)}
+    return sorted(sessions) + sorted(labelled)
 
 
 def is_finished(plan: Plan, task: Task) -> bool:
-    """Whether the task's last file is there and whole. External results may have changed since."""
-    if not task.label:
-        return has_session(plan, task.trial)
-    source = part_source(task.finished(plan))
+    """Whether the task's last file is there; external results may have changed since."""
     if task.label in plan.outside:
-        return source == external_digest(plan, task.trial, task.label)
-    return source is not None
+        digest = external_digest(plan, task.trial, task.label)
+        return part_source(task.finished(plan)) == digest
+    return task.finished(plan).exists()
 
 
-def has_session(plan: Plan, trial: Trial) -> bool:
-    """Whether `make_session` has finished with a trial."""
-    try:
-        read_session(plan, trial)
-    except (OSError, RecordingError):
-        return False
-    return True
-
-
-def do_task(plan: Plan, task: Task, needed: Sequence[object] = ()) -> Mapping[str, str]:
-    """Do a task, on one thread: its files are in the plan's folder when it ends.
-
-    Gives the environment. needed: what tasks gave that must have ended before.
-    """
-    task.trial.folder(plan).mkdir(parents=True, exist_ok=True)
+def do_task(plan: Plan, task: Task) -> None:
+    """Do a task, on one thread: its files are in the plan's folder when it ends."""
+    folder, label, source = task.trial.folder(plan), task.label, ""
+    folder.mkdir(parents=True, exist_ok=True)
     with threads(1):
-        if not task.label:
+        if not label:
             make_session(plan, task.trial)
-        elif task.label in plan.outside:
-            external_rows(plan, task.trial, task.label)
-        elif plan.policies:
-            run_policy(plan, task.trial, plan.policies[task.label])
+            return
+        if label in plan.outside:
+            source = external_digest(plan, task.trial, label)
+            rows = external_rows(plan, task.trial, label)
         else:
-            run_method(plan, task.trial, plan.contenders[task.label])
-    if task.label:
-        task.failed(plan).unlink(missing_ok=True)
-    return environment()
+            contender = {**plan.contenders, **plan.policies}[label]
+            rows_of = policy_rows if plan.policies else method_rows
+            with recording_in(folder / f"{label}.mcap" if plan.recordings else None) as recorder:
+                rows = rows_of(plan, task.trial, contender, recorder)
+    write_part(task.finished(plan), rows, PROBES if plan.policies else RESULTS, source)
+    task.failed(plan).unlink(missing_ok=True)
 
 
-def do_tasks(plan: Plan, tasks: Sequence[Task], client: Client, workers: int) -> Iterator[Ended]:
-    """Do tasks on Dask's workers, in this order; yields each when it has ended.
+def do_tasks(
+    plan: Plan, tasks: Sequence[Task], client: Client, workers: int
+) -> Iterator[tuple[Task, str]]:
+    """Do tasks on Dask's workers, sessions first; yields each when it has ended, with its failure.
 
-    A failure becomes part of the table; the next call tries again. There are no more tasks under
-    way than workers, so that none ends with a worker that another one kills.
+    There are no more under way than workers, so that none ends with a worker that another kills.
     """
     from distributed import wait
 
-    waiting = iter(tasks)
-    running: dict[Future, Task] = {}
-    sessions: dict[Trial, Future] = {}
-    failed: set[Trial] = set()
-    while True:
-        for task in islice(waiting, workers - len(running)):
-            needed = [sessions[trial] for trial in task.sessions(plan) if trial in sessions]
-            future = client.submit(do_task, plan, task, needed, key=None, pure=False)
-            running[future] = task
-            if not task.label:
-                sessions[task.trial] = future
-        if not running:
-            return
-        for future in wait(list(running), return_when="FIRST_COMPLETED").done:
-            task = running.pop(future)
-            failure = _failure(future)
-            if failure and not task.label:
-                failed.add(task.trial)
-            elif failure:
-                of_session = not failed.isdisjoint(task.sessions(plan))
-                failure = f"session: {failure}" if of_session else failure
-                write_part(task.failed(plan), _failure_rows(plan, task, failure), plan.schema)
-            yield Ended(task, failure, {} if failure else future.result())
+    failed: dict[Trial, str] = {}  # sessions
+    for stage in ([t for t in tasks if not t.label], [t for t in tasks if t.label]):
+        reasons = {task: [failed[t] for t in task.sessions(plan) if t in failed] for task in stage}
+        for task in [task for task in stage if reasons[task]]:
+            yield task, _note(plan, task, f"session: {reasons[task][0]}")
+        waiting = iter([task for task in stage if not reasons[task]])
+        running: dict[Future, Task] = {}
+        while True:
+            for task in islice(waiting, workers - len(running)):
+                running[client.submit(do_task, plan, task, pure=False)] = task
+            if not running:
+                break
+            for future in wait(list(running), return_when="FIRST_COMPLETED").done:
+                task, failure = running.pop(future), _failure(future)
+                if failure and not task.label:
+                    failed[task.trial] = failure
+                yield task, _note(plan, task, failure)
 
 
 def _failure(future: Future) -> str:
@@ -121,17 +176,19 @@ def _failure(future: Future) -> str:
         raise ChselError("Dask's scheduler is gone; the same command goes on with another one")
     error = future.exception()
     if isinstance(error, KilledWorker):
-        times = error.allowed_failures + 1
-        return f"its worker died {times} times, as of a lack of memory"
+        return f"its worker died {error.allowed_failures + 1} times, as of a lack of memory"
     return "" if error is None else one_line(error)
 
 
-def _failure_rows(plan: Plan, task: Task, reason: str) -> list[Row]:
-    """A row a step, or one without a step if there is no session that has the steps."""
-    about = {**plan.about(task.trial, task.label), "status": f"failed: {reason}"}
-    if plan.policies or not has_session(plan, task.trial):
-        return [about]
-    return [{**about, "step": step} for step in read_session(plan, task.trial).steps]
+def _note(plan: Plan, task: Task, failure: str) -> str:
+    """Make a failure a part of the table: a row a step, or one if there is no session's steps."""
+    if failure and task.label:
+        row = {**plan.about(task.trial, task.label), "status": f"failed: {failure}"}
+        told = task.trial.folder(plan) / "session.json"
+        steps = read_told(told.parent)["steps"] if told.exists() and not plan.policies else [None]
+        rows = [{**row, "step": step} for step in steps]
+        write_part(task.failed(plan), rows, PROBES if plan.policies else RESULTS)
+    return failure
 
 
 def dask_setup(worker: object) -> None:

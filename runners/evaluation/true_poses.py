@@ -2,31 +2,67 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from chsel.errors import SessionError, SettingError
 from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import require_threads
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.pose_scan import TruePoseSettings, find_true_pose
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.poses import apply, compose, inverse, roll_pitch_yaw
 from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.settings import CheckedSettings
+from chsel.problem.streams import StreamKey
 from runners.evaluation.plan import Plan, Trial
 from runners.objects.loader import load_object
+from runners.objects.scans import AssetsConfig
 from runners.sensors.pose_file import SUFFIX, beside, read_pose, write_pose
+from runners.sessions.problem_source import Source, open_source
 from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
 from runners.simulated_robot.settings import RobotSettings
 
 TRUTH = ".truth.yaml"
 _POSITION_STEP = 0.01  # metres: about as well as a person sets a pose by hand
 _ANGLE_STEP = np.deg2rad(10.0)
+
+
+@dataclass(frozen=True)
+class SourceConfig(CheckedSettings):
+    """The settings of a command on a recording, a raw log or known points; Any is for others."""
+
+    object: Any
+    session: Any
+    assets: AssetsConfig
+    file: str | None
+    out: str | None
+    seed: int
+    threads: Annotated[int, require_threads]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.file:
+            raise SettingError("file is missing; pass a recording.mcap, a raw log or known points")
+        StreamKey(self.seed, 0)
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return Path(self.file or "").expanduser()
+
+    def folder(self, usual: Path) -> Path:
+        """Where to write."""
+        return Path(self.out).expanduser() if self.out else usual
+
+    def open(self) -> Source:
+        """What the file holds."""
+        return open_source(self.path, self.object, self.session, self.assets.folder, self.seed)
 
 
 def sought_pose(
@@ -39,8 +75,8 @@ def sought_pose(
     """The pose of least evaluation cost near a guess, both world_from_object (4, 4), and numbers.
 
     problem: of a session's last step. mesh: of the object, m. truth: (4, 4), where it is known. The
-    numbers are plain values, for files: metres and radians, modulo the object's symmetries, at its
-    centre. Raises SessionError if there is no contact.
+    numbers are plain values: metres and radians, modulo the object's symmetries, at its centre.
+    Raises SessionError if there is no contact.
     """
     if len(problem.points.known) == 0:
         raise SessionError("there is no contact; accepted: a session that touched the object")
@@ -86,47 +122,25 @@ def fit(
     }
 
 
-def true_poses(folder: Path, experiment: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What was found in all trials of an evaluation that are there, of sessions from sensors.
-
-    moved, turned: from the guess. position_error, rotation_error: from the truth, where a
-    simulation knows it, else None.
-    """
-    found = []
-    for configuration in experiment["configurations"]:
-        for seed in experiment["seeds"]:
-            path = folder / "trials" / str(configuration) / f"seed_{seed}" / "session.json"
-            with suppress(OSError, ValueError, KeyError, TypeError):  # not there, or half there
-                numbers = json.loads(path.read_text())["truth"]
-                guess, truth = numbers["from_guess"], numbers.get("from_known") or {}
-                found.append(
-                    {
-                        "configuration": configuration,
-                        "seed": seed,
-                        "mean_distance": numbers["mean_distance"],
-                        "violations": numbers["violations"],
-                        "moved": guess["position"],
-                        "turned": guess["rotation"],
-                        "position_error": truth.get("position"),
-                        "rotation_error": truth.get("rotation"),
-                    }
-                )
-    return found
+def pose_beside(path: Path) -> FloatArray:
+    """world_from_object (4, 4) of the pose file beside a log, a recording or a file of points."""
+    if not beside(path).exists():
+        raise SettingError(
+            f"{path} has no true pose, and there is no {beside(path).name} beside it; accepted: a "
+            f"pose that `python -m runners.align {path} position=[x,y,z] rotation=[roll,pitch,yaw]`"
+            " finds, with object=NAME session/rig=NAME for a log"
+        )
+    return read_pose(beside(path))
 
 
 def check_log(plan: Plan, trial: Trial) -> None:
     """Raise SettingError unless a trial's log and a guess of its pose are there, or can be made."""
-    configuration, log = plan.configurations[trial.configuration], trial.log(plan)
-    if configuration.log_folder is None:
-        return
-    if not log.exists():
-        raise SettingError(f"there is no {log}; accepted: seeds of which there are logs")
-    if not beside(log).exists():
-        raise SettingError(
-            f"there is no {beside(log)}; accepted: the pose that `python -m runners.align {log} "
-            "object=NAME session/rig=NAME position=[x,y,z] rotation=[roll,pitch,yaw]` finds"
-        )
-    read_pose(beside(log))
+    if plan.configurations[trial.configuration].log_folder is not None:
+        if not trial.log(plan).exists():
+            raise SettingError(
+                f"there is no {trial.log(plan)}; accepted: seeds of which there are logs"
+            )
+        pose_beside(trial.log(plan))
 
 
 def ensure_log(plan: Plan, trial: Trial) -> Path:
@@ -147,23 +161,16 @@ def ensure_log(plan: Plan, trial: Trial) -> Path:
 
 
 def is_missing(plan: Plan, trial: Trial) -> bool:
-    """Whether a trial's log is still to be simulated."""
-    recorded = plan.configurations[trial.configuration].log_folder is not None
-    return not recorded and not _is_usable(trial.log(plan))
+    """Whether a trial's log, or what tells about its object's pose, is still to be simulated."""
+    log = trial.log(plan)
+    there = log.exists() and (beside(log).exists() or _truth_path(log).exists())
+    return plan.configurations[trial.configuration].log_folder is None and not there
 
 
 def guessed_pose(log: Path) -> FloatArray:
-    """world_from_object (4, 4) about where a log's object is.
-
-    That of the pose file beside it; of a simulated robot its truth, as roughly as a person
-    sets a pose.
-    """
-    if beside(log).exists():
-        return read_pose(beside(log))
-    truth = simulated_truth(log)
-    if truth is None:
-        raise SettingError(f"there is no {beside(log)}; accepted: a pose that runners.align finds")
-    return as_set_by_hand(truth)
+    """world_from_object (4, 4) about where a log's object is: beside it, or its truth roughly."""
+    truth = None if beside(log).exists() else simulated_truth(log)
+    return pose_beside(log) if truth is None else as_set_by_hand(truth)
 
 
 def simulated_truth(log: Path) -> FloatArray | None:
@@ -175,22 +182,10 @@ def simulated_truth(log: Path) -> FloatArray | None:
 def as_set_by_hand(world_from_object: FloatArray) -> FloatArray:
     """A pose (4, 4) to whole centimetres, and to whole 10 degrees of roll, pitch and yaw."""
     position = np.rint(world_from_object[:3, 3] / _POSITION_STEP) * _POSITION_STEP
-    angles = np.rint(angles_of(world_from_object[:3, :3]) / _ANGLE_STEP) * _ANGLE_STEP
-    return compose(roll_pitch_yaw(angles), position)
-
-
-def angles_of(rotation: FloatArray) -> FloatArray:
-    """Angles (3,) about the world's x, y and z, in this order, of a rotation (3, 3)."""
-    pitch = np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0))
-    roll = np.arctan2(rotation[2, 1], rotation[2, 2])
-    return np.array([roll, pitch, np.arctan2(rotation[1, 0], rotation[0, 0])])
+    angles = Rotation.from_matrix(world_from_object[:3, :3]).as_euler("xyz")
+    return compose(roll_pitch_yaw(np.rint(angles / _ANGLE_STEP) * _ANGLE_STEP), position)
 
 
 def _truth_path(log: Path) -> Path:
     path = beside(log)
     return path.with_name(path.name.removesuffix(SUFFIX) + TRUTH)
-
-
-def _is_usable(log: Path) -> bool:
-    """Whether there is a log with something that tells about its object's pose."""
-    return log.exists() and (beside(log).exists() or _truth_path(log).exists())

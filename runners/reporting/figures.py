@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,11 +54,16 @@ class Style:
     marker: str
     line: str
 
+    @property
+    def looks(self) -> dict[str, Any]:
+        """Of a line, as matplotlib takes them."""
+        return {"color": self.color, "marker": self.marker, "linestyle": self.line}
+
 
 Styles = Mapping[str, Style]
 # Colours after Okabe and Ito, and Tol: apart for colour-blind eyes. Variants of a method share a
 # hue, a lighter one and broken lines for the second.
-_METHODS = {
+_KNOWN = {
     "chsel": Style("CHSEL", "#0072b2", "o", "-"),
     "chsel_cma_me": Style("CHSEL (CMA-ME)", "#56b4e9", "s", "--"),
     "gradient_descent": Style("Gradient descent", "#009e73", "^", "-"),
@@ -69,8 +73,7 @@ _METHODS = {
     "cvo_no_free_space": Style("CVO (no free space)", "#f08a5d", "<", "--"),
     "medial_constraint": Style("Medial Constraint", "#882255", "X", "-"),
     "medial_constraint_cma_me": Style("Medial Constraint (QD)", "#d889b8", "p", "--"),
-}
-_POLICIES = {
+    # policies
     "grid": Style("grid", "#222222", "s", "--"),
     "random": Style("random", "#999999", "d", "--"),
     "nearest_mean": Style("nearest mean", "#56b4e9", "^", "-"),
@@ -84,23 +87,10 @@ _OTHERS = ("#117733", "#332288", "#999933", "#999999", "#661100", "#44aa99")
 _OTHER_MARKERS = ("h", "d", ">", "8", "*", "H")
 
 
-def method_styles(methods: Sequence[str]) -> dict[str, Style]:
-    """The looks of methods in the order in which all figures have them: ours, then by name.
-
-    A variant such as "chsel@paper" and a method from outside look the same in all figures of one
-    report, by their place among the names.
-    """
-    return _styles(methods, _METHODS)
-
-
-def policy_styles(policies: Sequence[str]) -> dict[str, Style]:
-    """The looks of policies, likewise."""
-    return _styles(policies, _POLICIES)
-
-
-def _styles(names: Sequence[str], known: Styles) -> dict[str, Style]:
-    styles = {name: style for name, style in known.items() if name in names}
-    for index, name in enumerate(sorted(set(names) - set(known))):
+def styles_of(names: Collection[str]) -> dict[str, Style]:
+    """The looks of methods or policies in the order of all figures: ours, then by name."""
+    styles = {name: style for name, style in _KNOWN.items() if name in names}
+    for index, name in enumerate(sorted(set(names) - set(_KNOWN))):
         color = _OTHERS[index % len(_OTHERS)]
         marker = _OTHER_MARKERS[(index // len(_OTHERS) + index) % len(_OTHER_MARKERS)]
         styles[name] = Style(name, color, marker, ":")
@@ -134,71 +124,51 @@ def new_figure(height: float) -> Figure:
 
 
 def curves(
-    name: str,
-    alt: str,
-    data: pd.DataFrame,
-    styles: Styles,
-    *,
-    x: str,
-    y: str,
-    by: str,
-    panel: str,
-    labels: tuple[str, str | Mapping[str, str]],
-) -> Picture:
-    """A panel for each value of one column, with a line and a band for each value of another.
+    name: str, data: pd.DataFrame, styles: Styles, across: str, up: str | Mapping[str, str]
+) -> Picture | None:
+    """A panel for each value of the first column, with a line and a band for each of the second.
 
-    data: besides columns `x`, `y`, `by` and `panel`, `lower` and `upper` of the bands.
-    labels: of the x axis, and of the y axis for all panels, which then have titles, or for each.
+    The third column is x; the last three are the band's lower edge, the line and the upper edge.
+    across: label of x. up: of y in all panels, which then have titles, or in each. None of no row.
     """
-    names = list(dict.fromkeys(data[panel]))
-    figure, axes = _panels(len(names))
-    for place, (axis, value) in enumerate(zip(axes, names, strict=True)):
-        shown = data[data[panel] == value]
+    if data.empty:
+        return None
+    _, by, x, *_, low, y, high = data.columns
+    figure, panels = _panels(data)
+    for axis, value, shown, lowest in panels:
         at = sorted(shown[x].unique())
         for index, (key, style) in enumerate(styles.items()):
             own = shown[shown[by] == key].set_index(x)
             if own.empty:
                 continue
-            own = own[["lower", y, "upper"]].astype(float).reindex(at)  # a gap without a number
+            own = own[[low, y, high]].astype(float).reindex(at)  # a gap without a number
             every = max(1, len(at) // 12)
-            axis.fill_between(at, own["lower"], own["upper"], color=style.color, alpha=0.12, lw=0)
-            axis.plot(
-                at,
-                own[y],
-                color=style.color,
-                marker=style.marker,
-                linestyle=style.line,
-                markevery=(index % every, every),
-            )
-        positive_scale(axis, pd.concat([shown["lower"], shown["upper"]]))
+            axis.fill_between(at, own[low], own[high], color=style.color, alpha=0.12, lw=0)
+            axis.plot(at, own[y], markevery=(index % every, every), **style.looks)
+        positive_scale(axis, pd.concat([shown[low], shown[high]]))
         axis.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
-        across, up = labels
-        axis.set_title(value.replace("_", " ") if isinstance(up, str) else "")
-        axis.set_xlabel(across if place >= len(names) - 3 else "")
-        axis.set_ylabel(up if isinstance(up, str) else up[value])
-    _legend(figure, [style for key, style in styles.items() if (data[by] == key).any()])
-    return Picture(name, alt, figure, data)
+        title, label = (value.replace("_", " "), up) if isinstance(up, str) else ("", up[value])
+        axis.set(title=title, xlabel=across if lowest else "", ylabel=label)
+    drawn = [style for key, style in styles.items() if (data[by] == key).any()]
+    handles = [Line2D([], [], label=style.title, **style.looks) for style in drawn]
+    place: Any = {"loc": "outside lower center", "ncols": min(len(drawn), 5), "handlelength": 2.6}
+    figure.legend(handles=handles, **place)
+    numbers = up if isinstance(up, str) else " and ".join(up.values())
+    titles = ", ".join(style.title for style in drawn)
+    return Picture(name, f"{numbers} by {across}: {y} of {titles}.", figure, data)
 
 
-def boxes(
-    name: str,
-    alt: str,
-    data: pd.DataFrame,
-    styles: Styles,
-    *,
-    y: str,
-    by: str,
-    panel: str,
-    label: str,
-) -> Picture:
-    """A panel for each value of one column, with a box for each value of another.
+def boxes(name: str, data: pd.DataFrame, styles: Styles, label: str) -> Picture | None:
+    """A panel for each value of the first column, with a box of the last for each of the second.
 
-    Boxes span the quartiles; whiskers reach to the last number within 1.5 boxes.
+    label: of the numbers in the last column. None without a row.
     """
-    names = sorted(data[panel].unique())
-    figure, axes = _panels(len(names))
-    for place, (axis, value) in enumerate(zip(axes, names, strict=True)):
-        shown = data[data[panel] == value]
+    if data.empty:
+        return None
+    by, y = data.columns[1], data.columns[-1]
+    figure, panels = _panels(data)
+    titles = [style.title for style in styles.values()]
+    for axis, value, shown, lowest in panels:
         for index, (key, style) in enumerate(styles.items()):
             axis.boxplot(
                 shown.loc[shown[by] == key, y],
@@ -210,31 +180,25 @@ def boxes(
                 flierprops={"marker": "D", "markersize": 3.0, "markerfacecolor": style.color},
             )
         positive_scale(axis, shown[y])
-        axis.set_title(value.replace("_", " "))
-        axis.set_ylabel(label)
-        names_below = [style.title for style in styles.values()]
-        lowest = place >= len(names) - 3
-        axis.set_xticks(range(len(styles)), names_below if lowest else [], rotation=40, ha="right")
+        axis.set(title=value.replace("_", " "), ylabel=label)
+        axis.set_xticks(range(len(styles)), titles if lowest else [], rotation=40, ha="right")
         axis.grid(axis="x", visible=False)
-    return Picture(name, alt, figure, data)
+    return Picture(
+        name, f"Box plots of {label}: a box for each of {', '.join(titles)}.", figure, data
+    )
 
 
-def _panels(count: int) -> tuple[Figure, list[Axes]]:
-    """Panels, three in a row, with room for a legend below."""
-    columns = min(3, count)
-    rows = math.ceil(count / columns)
-    figure = new_figure(0.9 + 3.6 * rows)
-    return figure, [figure.add_subplot(rows, columns, place + 1) for place in range(count)]
-
-
-def _legend(figure: Figure, styles: Sequence[Style]) -> None:
-    """One legend for all panels, below them."""
-    handles = []
-    for style in styles:
-        looks: Any = {"color": style.color, "marker": style.marker, "linestyle": style.line}
-        handles.append(Line2D([], [], label=style.title, **looks))
-    columns = min(len(styles), 5)
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns, handlelength=2.6)
+def _panels(data: pd.DataFrame) -> tuple[Figure, list[tuple[Axes, str, pd.DataFrame, bool]]]:
+    """A panel a value of the first column: axes, value, rows, and whether no panel is below."""
+    column = data.columns[0]
+    names = list(dict.fromkeys(data[column]))
+    across = min(3, len(names))
+    down = math.ceil(len(names) / across)
+    figure, panels = new_figure(0.9 + 3.6 * down), []
+    for place, value in enumerate(names):
+        axis = figure.add_subplot(down, across, place + 1)
+        panels.append((axis, value, data[data[column] == value], place >= len(names) - 3))
+    return figure, panels
 
 
 def positive_scale(axes: Axes, values: pd.Series) -> None:
@@ -257,23 +221,11 @@ def positive_scale(axes: Axes, values: pd.Series) -> None:
         ticks.set_minor_formatter(NullFormatter())
 
 
-def file_content(figure: Figure, kind: str) -> bytes:
-    """A file of one of the FORMATS, without anything that tells when and with what it was made."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format=kind, dpi=_DPI, metadata=_NO_CLOCKS[kind])
-    return stream.getvalue()
-
-
-def write_picture(
-    picture: Picture, folder: Path, kind: str, *, accepted: str = "a folder that can be written"
-) -> tuple[Path, Path]:
-    """Write the figure as a file of one of the FORMATS, and its data as CSV beside it.
-
-    accepted: the end of the error if the folder cannot be written. Returns both files.
-    """
+def write_picture(picture: Picture, folder: Path, kind: str) -> tuple[Path, Path]:
+    """Write the figure in one of the FORMATS, without a clock, and its data as CSV beside it."""
     path, data = folder / f"{picture.name}.{kind}", folder / f"{picture.name}.csv"
-    with whole_file(path, accepted) as beside:
-        beside.write_bytes(file_content(picture.figure, kind))
-    with whole_file(data, accepted) as beside:
+    with whole_file(path) as beside:
+        picture.figure.savefig(beside, format=kind, dpi=_DPI, metadata=_NO_CLOCKS[kind])
+    with whole_file(data) as beside:
         picture.data.to_csv(beside, index=False, lineterminator="\n")
     return path, data

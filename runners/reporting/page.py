@@ -11,12 +11,12 @@ from typing import Any
 
 from markdown_it import MarkdownIt
 
-from runners.evaluation.experiment import flattened
+from runners.evaluation.experiment import flat
 from runners.reporting.evaluation_folder import Evaluation, trials_of
 from runners.reporting.figures import Picture
 from runners.reporting.tables import Table, table_of
 
-_NOT_SHOWN = ("environment", "other_environments", "commands", "methods", "policies", "format")
+_NOT_SHOWN = ("environments", "commands", "methods", "policies")
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 75rem; margin: 0 auto; padding: 1rem; }
 p { max-width: 48rem; }
@@ -40,7 +40,8 @@ def as_markdown(
     evaluation: Evaluation, sections: Sequence[Section], command: str, kind: str
 ) -> str:
     """The report. command: that makes it again. kind: of its pictures' files, one of FORMATS."""
-    parts = [f"# Evaluation {_escaped(evaluation.name)}", *map(_escaped, _lead(evaluation))]
+    name = _escaped(evaluation.experiment["name"])
+    parts = [f"# Evaluation {name}", _escaped(_lead(evaluation))]
     for section in sections:
         parts += [f"## {section.title}", _escaped(section.text)]
         if (picture := section.picture) is not None:
@@ -66,26 +67,17 @@ def as_html(markdown: str, pictures: Mapping[str, bytes]) -> str:
     return f'<!DOCTYPE html>\n<html lang="en">\n<head>\n{head}\n</head>\n{body}</html>\n'
 
 
-def _lead(evaluation: Evaluation) -> Iterator[str]:
+def _lead(evaluation: Evaluation) -> str:
     """What the report is about."""
-    rows, probes = evaluation.rows, evaluation.probes
-    if len(probes):
-        yield (
-            f"{probes['policy'].nunique()} policies on {len(trials_of(probes))} trials of "
-            f"{probes['object'].nunique()} objects: {len(probes)} probes, after which "
-            f"{', '.join(sorted(probes['method'].dropna().unique()))} registered, from the first "
-            "contact on."
-        )
-    elif len(rows):
-        yield (
-            f"{rows['method'].nunique()} methods on {len(trials_of(rows))} trials of "
-            f"{rows['object'].nunique()} objects: {len(rows)} registrations. PD is plausible "
-            "diversity in mm², lower is better; the best median of a row is bold, in brackets are "
-            "its quartiles, and n is how many numbers are behind it."
-        )
-        yield f"Plausible sets are by the definition {evaluation.definition_text}."
-    else:
-        yield "Nothing is finished yet: there is no registration to report on."
+    done = evaluation.probes if evaluation.experiment["policies"] else evaluation.rows
+    if done.empty:
+        return "Nothing is finished yet: there is no registration to report on."
+    return (
+        f"{len(done)} rows of {len(trials_of(done))} trials with {done['object'].nunique()} "
+        "objects. PD is plausible diversity in mm², lower is better, by plausible sets of the "
+        f"definition {evaluation.definition_text}. The best median of a row is bold, in brackets "
+        "are its quartiles, and n is how many numbers are behind it."
+    )
 
 
 def _table(table: Table) -> list[str]:
@@ -110,8 +102,7 @@ def _escaped(text: str) -> str:
 def _made(experiment: Mapping[str, Any]) -> Iterator[Table]:
     """Settings and versions."""
     settings = {name: value for name, value in experiment.items() if name not in _NOT_SHOWN}
-    others = {f"other {n}": v for n, v in enumerate(experiment["other_environments"])}
-    versions = {**experiment["environment"], **others}
+    versions = {str(n): one for n, one in enumerate(experiment["environments"], 1)}
     for title, values in (("Settings", settings), ("Versions", versions)):
-        lines = ({"name": name, "value": str(value)} for name, value in flattened(values))
+        lines = ({"name": name, "value": str(value)} for name, value in flat(values).items())
         yield table_of(title, lines, labels=2)

@@ -6,27 +6,29 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from runners.reporting.evaluation_folder import TRIAL, Evaluation, ReportError
+from chsel.errors import SettingError
+from runners.reporting.evaluation_folder import TRIAL, Evaluation
 
-DIVERSITY = "diversity"
-"""The column with PD in mm^2."""
+DIVERSITY = "diversity"  # the column with PD in mm^2
 LEAST_PD = 1.0  # mm^2: a PD below counts as this in geometric means, which a 0 would make 0
-_WORSE = 1.0 + 1e-9  # a ratio above; the rounding of a geometric mean makes no PD worse
+LEAST_ERROR = 1e-4  # metres: an error below counts as this in geometric means
+GOOD = 0.010  # metres: what counts as found
+REFERENCE = "information"  # with which all policies are compared, unless another is asked for
+PROBES = 10  # after so many errors are compared, or at the end of shorter sessions
+SESSION = ["policy", *TRIAL]  # the columns that tell sessions apart
 _RESAMPLES = 2000
-_HIT_BINS = np.linspace(0.0, 1.0, 11)
 
 
 def spreads(rows: pd.DataFrame, by: str | Sequence[str], column: str) -> pd.DataFrame:
-    """A row per group with the spread of a column's numbers.
+    """A row per group with the spread of a column's numbers; NaN where there are none.
 
-    Columns: count of the numbers; left_out, how many more there could be were they not missing;
-    lower, median and upper quartile, interpolated between neighbours; mean and deviation (the
-    standard deviation over n); NaN where there are no numbers.
+    left_out: how many are missing. lower, upper: quartiles, interpolated. deviation: over n.
     """
     groups = rows.astype({column: float}).groupby(by, observed=True)[column]
     count = groups.count()
@@ -44,20 +46,15 @@ def spreads(rows: pd.DataFrame, by: str | Sequence[str], column: str) -> pd.Data
 
 
 def shares(rows: pd.DataFrame, by: str | Sequence[str], column: str) -> pd.DataFrame:
-    """A row per group: how many of a column's flags are set, of how many, and their share.
+    """A row per group with flags in a column: how many are set, of how many, and their share.
 
     lower, upper: 95 % interval of the share of independent cases (Wilson's score interval).
-    Groups without a flag have no row.
     """
     flags = rows[rows[column].notna()].astype({column: int}).groupby(by, observed=True)[column]
     found = pd.DataFrame({"count": flags.sum(), "total": flags.size(), "share": flags.mean()})
-    counts = zip(found["count"], found["total"], strict=True)
-    tests = [binomtest(count, total) for count, total in counts]
-    intervals = [test.proportion_ci(method="wilson") for test in tests]
-    return found.assign(
-        lower=[interval.low for interval in intervals],
-        upper=[interval.high for interval in intervals],
-    )
+    tests = map(binomtest, found["count"], found["total"])
+    intervals = [tuple(test.proportion_ci(method="wilson")) for test in tests]
+    return found.join(pd.DataFrame(intervals, found.index, ["lower", "upper"]))
 
 
 def geometric_mean(values: pd.Series) -> float:
@@ -68,7 +65,7 @@ def geometric_mean(values: pd.Series) -> float:
 def with_ratios(rows: pd.DataFrame, baseline: str) -> pd.DataFrame:
     """The rows with `floored`, PD of at least LEAST_PD, and `ratio`, that by the baseline's.
 
-    The baseline's PD at a trial and step is the geometric mean over its draws.
+    Of the baseline the geometric mean over its draws at the same trial and step.
     """
     place = [*TRIAL, "step"]
     rows = rows.assign(floored=rows[DIVERSITY].clip(lower=LEAST_PD))
@@ -77,17 +74,8 @@ def with_ratios(rows: pd.DataFrame, baseline: str) -> pd.DataFrame:
     return rows.assign(ratio=rows["floored"] / rows["of_baseline"])
 
 
-def share_worse(ratios: pd.Series) -> float:
-    """How many of the ratios are above 1; NaN of nothing."""
-    ratios = ratios.dropna()
-    return float((ratios > _WORSE).mean()) if len(ratios) else math.nan
-
-
 def bootstrap_interval(values: pd.Series) -> tuple[float, float]:
-    """95 % interval of the mean of values by (configuration, seed), configurations resampled.
-
-    The same every time.
-    """
+    """95 % interval of the mean of values by (configuration, seed), configurations resampled."""
     groups = values.groupby("configuration")
     sums, counts = groups.sum().to_numpy(), groups.count().to_numpy()
     drawn = np.random.default_rng(0).integers(len(sums), size=(_RESAMPLES, len(sums)))
@@ -97,43 +85,25 @@ def bootstrap_interval(values: pd.Series) -> tuple[float, float]:
 
 
 def first_below(values: pd.DataFrame, limit: float) -> pd.Series:
-    """The number of probes (the columns) after which sessions (the rows) first are below a limit.
-
-    Infinite for those that never are.
-    """
-    below = values.to_numpy() < limit
-    number = np.array(values.columns, dtype=float)[np.argmax(below, axis=1)]
-    return pd.Series(np.where(below.any(axis=1), number, np.inf), values.index)
+    """The number of probes (columns) after which sessions (rows) are first below; else infinite."""
+    below = values < limit
+    return below.idxmax(axis=1).where(below.any(axis=1), np.inf).astype(float)
 
 
 def censored_quantile(numbers: pd.Series, share: float) -> float:
-    """The least number by which this share of the sessions has come there; infinite if none.
+    """The least number by which this share of the sessions, or none, has come there: Kaplan-Meier.
 
-    Sessions that end before count as infinite, so this is the Kaplan-Meier estimate: nothing is
-    censored before the budget is spent. NaN of no session.
+    Sessions that never do are infinite: nothing is censored before the budget is spent.
     """
-    if numbers.empty:
-        return math.nan
-    return float(np.quantile(numbers, share, method="inverted_cdf"))
+    return float(np.quantile(numbers, share, method="inverted_cdf")) if len(numbers) else math.nan
 
 
 def hit_bins(rows: pd.DataFrame) -> pd.DataFrame:
     """`shares` of hits by tenths of their forecast, with the mean `forecast` of each."""
-    tenth = np.digitize(rows["hit_forecast"], _HIT_BINS).clip(max=10) - 1
-    rows = rows.assign(tenth=tenth)
+    tenths = np.digitize(rows["hit_forecast"], np.linspace(0.0, 1.0, 11)).clip(max=10) - 1
+    rows = rows.assign(tenth=tenths)
     forecasts = rows.groupby("tenth")["hit_forecast"].mean()
     return shares(rows, "tenth", "hit").join(forecasts.rename("forecast"))
-
-
-REFERENCE = "information"
-"""The policy that all others are compared with, unless another one is asked for."""
-LEAST_ERROR = 1e-4  # metres: an error below counts as this in geometric means
-GOOD = 0.010  # metres: what counts as found
-LIMITS = (0.020, GOOD, 0.005)  # metres
-PROBES = 10
-"""After so many probes errors are compared, or at the end of shorter sessions."""
-SESSION = ["policy", *TRIAL]
-"""The columns that tell sessions apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,14 +112,10 @@ class SteeredSessions:
 
     policies: list[str]  # with a finished session
     budget: int  # probes of a session, at most
-    rows: pd.DataFrame  # with the columns of runners.evaluation.table.PROBES
+    rows: pd.DataFrame  # with the columns of runners.evaluation.experiment.PROBES
+    count: int  # trials
     left_out: int  # trials that some policy has and another one has not
     reference: str  # one of the policies, that others are compared with
-
-    @property
-    def count(self) -> int:
-        """Trials."""
-        return self.rows.groupby(TRIAL).ngroups
 
     @cached_property
     def errors(self) -> pd.DataFrame:
@@ -184,41 +150,43 @@ class SteeredSessions:
 
 
 def steered_sessions(evaluation: Evaluation, reference: str | None = None) -> SteeredSessions:
-    """The sessions of an evaluation. Raises ReportError for a reference without any."""
+    """The sessions of an evaluation. Raises SettingError for a reference without any."""
     rows = evaluation.probes
     rows = rows[rows["probes"].notna()].astype({"probes": int})
     first = rows[rows["error"].notna()].groupby(SESSION)["probes"].min()
     begun = first[first == 1].reset_index()
-    policies = [name for name in evaluation.policies if (begun["policy"] == name).any()]
+    asked = evaluation.experiment["policies"]
+    policies = [name for name in asked if (begun["policy"] == name).any()]
     if reference is not None and reference not in policies:
-        raise ReportError(f"baseline {reference} has no session; accepted: {', '.join(policies)}")
+        raise SettingError(f"baseline {reference} has no session; accepted: {', '.join(policies)}")
     if reference is None and policies:
         reference = REFERENCE if REFERENCE in policies else policies[0]
     having = begun.groupby(TRIAL)["policy"].nunique()
     common = having[having == len(policies)].index
     kept = pd.MultiIndex.from_frame(rows[TRIAL]).isin(common) & rows["policy"].isin(policies)
-    asked = evaluation.experiment["policies"].values()
-    budget = min((one["settings"]["probes"] for one in asked), default=1)
+    budget = min((one["settings"]["probes"] for one in asked.values()), default=1)
     rows = rows[kept & (rows["probes"] <= budget)].reset_index(drop=True)
-    return SteeredSessions(policies, budget, rows, len(having) - len(common), reference or "")
+    left_out = len(having) - len(common)
+    return SteeredSessions(policies, budget, rows, len(common), left_out, reference or "")
 
 
 def geometric_means(values: pd.DataFrame) -> pd.DataFrame:
     """By policy and number of probes, of `over_probes`, metres."""
-    logs = np.log(values.clip(lower=LEAST_ERROR))
-    return np.exp(logs.groupby("policy", sort=False).mean())
+    return np.exp(_logs(values).groupby("policy", sort=False).mean())
+
+
+def _logs(errors: Any) -> Any:
+    return np.log(errors.clip(lower=LEAST_ERROR))
 
 
 def means_with_intervals(sessions: SteeredSessions, column: str) -> pd.DataFrame:
-    """By policy and number of probes: `mean`, geometric, and its 95 % interval, metres."""
-    values = sessions.over_probes(column)
-    logs, lines = np.log(values.clip(lower=LEAST_ERROR)), []
+    """By number (the column), policy and probes: `mean`, geometric, and its 95 % interval."""
+    logs, lines = _logs(sessions.over_probes(column)), []
     for policy in sessions.policies:
         for probes, own in logs.loc[policy].items():
-            lower, upper = np.exp(bootstrap_interval(own))
-            mean = float(np.exp(own.mean()))
-            lines.append((policy, probes, lower, mean, upper))
-    return pd.DataFrame(lines, columns=["policy", "probes", "lower", "mean", "upper"])
+            lower, upper = bootstrap_interval(own)
+            lines.append((column, policy, probes, *np.exp([lower, own.mean(), upper])))
+    return pd.DataFrame(lines, columns=["number", "policy", "probes", "lower", "mean", "upper"])
 
 
 def ratios_to_best(sessions: SteeredSessions) -> pd.Series:
@@ -227,28 +195,20 @@ def ratios_to_best(sessions: SteeredSessions) -> pd.Series:
     return means.loc[sessions.reference] / means.drop(index=sessions.reference).min()
 
 
-@dataclass(frozen=True)
-class Paired:
-    """A policy beside the reference, over the same sessions."""
+def paired(sessions: SteeredSessions, policy: str) -> dict[str, float]:
+    """A policy beside the reference, whose wins and losses these are, over the same sessions.
 
-    sessions: int
-    wins: int  # sessions in which the reference has the smaller error
-    losses: int
-    sign_test: float  # chance of wins and losses as uneven as these if both were as good
-    median: float  # of the policy's error by the reference's
-    mean: float  # geometric, of the same
-    lower: float  # 95 % interval of that mean
-    upper: float
-
-
-def paired(sessions: SteeredSessions, policy: str) -> Paired:
-    """A policy beside the reference."""
-    errors = sessions.errors[sessions.compared].clip(lower=LEAST_ERROR)
-    logs = np.log(errors.loc[policy] / errors.loc[sessions.reference])
+    sign_test: chance of wins and losses as uneven if both were as good. Of the policy's error by
+    the reference's: median, geometric mean, and its 95 % interval.
+    """
+    errors = _logs(sessions.errors[sessions.compared])
+    logs = errors.loc[policy] - errors.loc[sessions.reference]
     wins, losses = int((logs > 0.0).sum()), int((logs < 0.0).sum())
     test = float(binomtest(wins, wins + losses).pvalue) if wins + losses else 1.0
-    ratios = [math.exp(log) for log in (logs.median(), logs.mean(), *bootstrap_interval(logs))]
-    return Paired(len(logs), wins, losses, test, *ratios)
+    lower, upper = bootstrap_interval(logs)
+    ratios = {"median": logs.median(), "mean": logs.mean(), "lower": lower, "upper": upper}
+    counts = {"sessions": len(logs), "wins": wins, "losses": losses, "sign_test": test}
+    return counts | {name: math.exp(log) for name, log in ratios.items()}
 
 
 def first_stops(rows: pd.DataFrame, spread: float) -> pd.DataFrame:

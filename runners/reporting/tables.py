@@ -8,16 +8,13 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import pandas as pd
-from rich.box import SIMPLE_HEAD
-from rich.measure import Measurement
-from rich.table import Table as RichTable
 
-from replay.console import Console
-from runners.reporting.figures import Style
+from replay.console import Console, plain_table
+from runners.reporting.figures import Styles
 from runners.reporting.statistics import DIVERSITY, spreads
 
-Best = Literal["min", "max"] | None
-"""Which median of a row is best."""
+Best = Literal["min", "max"] | None  # which number of a row is best
+_BEST: dict[str, Best] = {"rank": None, "exact_members": "max"}  # by column; of others "min"
 
 
 @dataclass(frozen=True)
@@ -81,55 +78,52 @@ def bold_best(values: Sequence[float], texts: Sequence[str], best: Best = "min")
 def median_cells(found: pd.DataFrame, best: Best) -> list[str]:
     """Median [quartiles] of each of the `spreads`; notes where numbers are fewer than elsewhere."""
     most, cells = found["count"].max(), []
-    for each in found.rename(columns={"count": "numbers"}).itertuples():
-        notes = [f"n {each.numbers}"] if 0 < each.numbers < most else []
-        notes += [f"{each.left_out} left out"] if each.left_out else []
+    for _, each in found.iterrows():
+        notes = [f"n {each['count']:.0f}"] if 0 < each["count"] < most else []
+        notes += [f"{each['left_out']:.0f} left out"] if each["left_out"] > 0 else []
         note = f" ({', '.join(notes)})" if notes else ""
-        cells.append(with_range(each.median, each.lower, each.upper) + note)
+        cells.append(with_range(each["median"], each["lower"], each["upper"]) + note)
     return bold_best(found["median"].tolist(), cells, best)
 
 
 def method_table(
-    title: str,
-    rows: pd.DataFrame,
-    by: str,
-    styles: Mapping[str, Style],
-    *,
-    column: str = DIVERSITY,
-    best: Best = "min",
-    note: str = "",
+    title: str, rows: pd.DataFrame, by: str, styles: Styles, column: str = DIVERSITY, note: str = ""
 ) -> Table:
     """Median [quartiles] of a column by what another one holds (rows) and by method (columns).
 
-    n: of numbers behind a median; a cell that has fewer says so. best: which of a row's medians is
-    bold.
+    n: of numbers behind a median; a cell that has fewer says so.
     """
-    lines = []
+    cells, counts = {}, {}
     for value, found in spreads(rows, [by, "method"], column).groupby(level=0, observed=True):
         of_methods = found.droplevel(0).reindex(list(styles))
-        of_methods = of_methods.fillna({"count": 0, "left_out": 0})
-        of_methods = of_methods.astype({"count": int, "left_out": int})
-        cells = median_cells(of_methods, best)
-        titles = [style.title for style in styles.values()]
-        line = {by: str(value), "n": int(of_methods["count"].max())}
-        lines.append(line | dict(zip(titles, cells, strict=True)))
+        of_methods["count"] = of_methods["count"].fillna(0)
+        cells[value] = median_cells(of_methods, _BEST.get(column, "min"))
+        counts[value] = int(of_methods["count"].max())
+    frame = pd.DataFrame.from_dict(cells, "index", columns=list(styles)).rename_axis(by)
+    return pivot_table(title, frame, styles, counts, note)
+
+
+def pivot_table(
+    title: str, cells: pd.DataFrame, styles: Styles, counts: Any = None, note: str = ""
+) -> Table:
+    """Texts by the index (rows) and by method or policy (columns); counts: n by row."""
+    lines = []
+    for value, texts in cells.reindex(columns=list(styles)).fillna("-").iterrows():
+        line = {str(cells.index.name): str(value), **({"n": counts[value]} if counts else {})}
+        lines.append(line | {style.title: texts[name] for name, style in styles.items()})
     return table_of(title, lines, note=note)
 
 
 def print_table(console: Console, table: Table) -> None:
     """A table with its title and its note; as wide as it is where there is no terminal."""
-    shown = RichTable(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    for index, name in enumerate(table.header):
-        text = index < table.labels
-        justify: Literal["left", "right"] = "left" if text else "right"
-        shown.add_column(name, justify=justify, no_wrap=text, vertical="bottom")
+    texts, numbers = table.header[: table.labels], table.header[table.labels :]
+    shown = plain_table(texts=texts, numbers=numbers)
+    for column in shown.columns:
+        column.vertical = "bottom"
     for row in table.rows:
         shown.add_row(*(cell.replace("**", "") for cell in row))
     console.print(table.title, soft_wrap=True)
-    if not console.is_terminal:
-        width = Measurement.get(console, console.options.update(width=10_000), shown).maximum
-        Console(file=console.file, width=width).print(shown)
-    else:
-        console.print(shown)
+    wide = console if console.is_terminal else Console(file=console.file, width=10_000)
+    wide.print(shown)
     if table.note:
         console.print(table.note, soft_wrap=not console.is_terminal)

@@ -12,10 +12,9 @@ import pyarrow.parquet
 
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.problem.settings import settings_mapping
-from runners.evaluation.table import ITERATIONS, PROBES, RESULTS
+from runners.evaluation.experiment import ITERATIONS, PROBES, RESULTS
 from runners.reporting.evaluation_folder import open_evaluation
-from runners.reporting.method_sections import sections_on_methods
-from runners.reporting.policy_sections import sections_on_policies
+from runners.reporting.sections import sections_of
 
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"
 Row = dict[str, Any]
@@ -50,9 +49,8 @@ def write_evaluation(
         "policies": {},
         "configurations": list(dict.fromkeys(one["configuration"] for one in rows or ())),
         "seeds": sorted({one["seed"] for one in rows or ()}),
-        "other_environments": [],
         "commands": ["python -m runners.evaluate experiment=made_up"],
-        "environment": {"python": "3.11", "package numpy": "2.4"},
+        "environments": [{"python": "3.11", "package numpy": "2.4"}],
         **experiment,
     }
     (folder / "experiment.json").write_text(json.dumps(described))
@@ -69,9 +67,7 @@ def write_table(path: Path, rows: Sequence[Row], schema: pa.Schema | None = RESU
 
 def tables_of(folder: Path, baseline: str | None = None) -> dict[str, list[list[str]]]:
     """The tables of a report by their titles, with their headers, without what is bold."""
-    evaluation = open_evaluation(folder)
-    steered = bool(evaluation.experiment["policies"])
-    sections = (sections_on_policies if steered else sections_on_methods)(evaluation, baseline)
+    sections = sections_of(open_evaluation(folder), baseline)
     return {
         table.title: [
             [cell.replace("**", "") for cell in row] for row in (table.header, *table.rows)

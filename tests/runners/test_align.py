@@ -12,17 +12,11 @@ import yaml
 
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_settings import EvaluationCostSettings
-from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.problem.mesh import clean_mesh
-from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import apply, axis_angle, compose, inverse
-from chsel.problem.registration_problem import RegistrationProblem
-from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.streams import StreamKey
 from replay.files import file_digest
 from replay.mcap.reader import read_recording
 from runners import align, plausible, probe
-from runners.evaluation.true_poses import sought_pose
 from runners.objects.loader import load_model
 from runners.sensors.pose_file import beside, read_pose
 from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
@@ -118,12 +112,6 @@ def test_the_found_pose_is_the_next_guess_and_what_is_there_stays(path: Path) ->
     assert about["cost"] <= about["guess_cost"]
 
 
-def test_a_pose_at_the_edge_of_the_search_is_a_warning(path: Path) -> None:
-    done = aligned(path, "position=[0.145,0.2,0.3]", "rotation=[0,0,0.5]", "search.reach=0.02")
-    assert done.returncode == 0
-    assert "at the edge of the search along x" in done.stdout
-
-
 def test_plausible_sets_are_made_around_the_pose_beside_a_recording(path: Path) -> None:
     refused = run(plausible.main, str(path), *SETS)
     assert refused.returncode == 2
@@ -132,7 +120,6 @@ def test_plausible_sets_are_made_around_the_pose_beside_a_recording(path: Path) 
     assert aligned(path, *NEAR).returncode == 0
     done = run(plausible.main, str(path), *SETS)
     assert (done.returncode, done.stderr) == (0, "")
-    assert f"true pose: that of {path.with_name('session.pose.yaml')}" in done.stdout
     x, y, z = read_pose(path.with_name("session.pose.yaml"))[:3, 3]
     assert f"around ({x:.3f}, {y:.3f}, {z:.3f}) m" in done.stdout
 
@@ -158,9 +145,6 @@ def test_a_raw_log_is_read_first_and_its_object_is_named(tmp_path: Path) -> None
     assert about["cost"] < about["guess_cost"]
     assert about["mean_distance"] < 0.004
     assert about["source"] == file_digest(log)
-    refused = run(plausible.main, str(log), "object=mustard")
-    assert refused.returncode == 2
-    assert "accepted for a raw log: session=sensors session/rig=NAME object=NAME" in refused.stderr
 
 
 @pytest.mark.parametrize(
@@ -168,35 +152,14 @@ def test_a_raw_log_is_read_first_and_its_object_is_named(tmp_path: Path) -> None
     [
         ((), "accepted: either position=[x,y,z] rotation=[roll,pitch,yaw]"),
         ((*NEAR, "pose=some.yaml"), "accepted: either position=[x,y,z]"),
-        (("position=[0,0]",), "align.position has 2 entries; accepted: 3"),
         (("position=[0,0,nan]",), "is not finite"),
         (("pose=none.yaml",), "pose file none.yaml: cannot be read"),
-        ((*NEAR, "search.reach=-1"), "reach is -1"),
-        ((*NEAR, "threads=10000"), "threads is 10000; accepted: an integer from 1 to 256"),
-        ((*NEAR, "serch.reach=1"), "has no key 'serch'"),
     ],
 )
 def test_what_cannot_be_searched_is_one_line(
     path: Path, arguments: tuple[str, ...], message: str
 ) -> None:
     done = run(align.main, str(path), *arguments)
-    assert done.returncode == 2
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert message in done.stderr
-    assert done.stderr.count("\n") == 1
     assert len(list(path.parent.iterdir())) == 1
-
-
-def test_distances_between_poses_are_modulo_symmetries_at_the_centre() -> None:
-    mesh = trimesh.creation.box((0.06, 0.1, 0.14))
-    mesh.apply_translation([0.5, 0.0, 0.0])
-    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-    half_turn[:3, 3] = [1.0, 0.02, 0.0]  # about the box's own axis, and 2 cm aside
-    contacts = apply(POSE, trimesh.sample.sample_surface(mesh, 60, seed=0)[0])
-    workspace = Workspace.around(contacts, 0.1)
-    sdf, points = SdfGrid.from_mesh(mesh, 0.005), KnownPoints(known=contacts)
-    problem = RegistrationProblem(sdf, points, np.eye(4)[None], workspace, 0.01, StreamKey(0, 0))
-    search = TruePoseSettings(reach=0.002, spacing=0.002, rotations=1)
-    _, numbers = sought_pose(problem, mesh, POSE, search, POSE @ half_turn)
-    assert numbers["from_known"]["position"] == pytest.approx(0.02, abs=0.004)
-    assert numbers["from_known"]["rotation"] == pytest.approx(0.0, abs=0.05)
-    assert numbers["mean_distance"] < 0.002

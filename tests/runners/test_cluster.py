@@ -19,31 +19,11 @@ import pytest
 from distributed.comm import connect
 
 from chsel.errors import SettingError
-from runners.evaluation.cluster import LocalConfig, SlurmConfig, connected, slurm_cluster
+from runners.evaluation.tasks import connected
 from tests.runners.test_evaluate import METHODS, evaluated
 
 pytestmark = pytest.mark.slow
 REPOSITORY = Path(__file__).resolve().parents[2]
-SBATCH = """#!/usr/bin/env bash
-cp "${*: -1}" "$(dirname "$0")/job"
-setsid bash "$(dirname "$0")/job" >/dev/null 2>&1 &
-echo "Submitted batch job $!"
-"""
-SCANCEL = """#!/usr/bin/env bash
-kill -- "-$1"
-"""
-SLURM = SlurmConfig(
-    jobs=2,
-    processes=8,
-    memory="16GB",
-    walltime="2:30:00",
-    queue="fast",
-    account="robots",
-    interface="lo",
-    directives=("--constraint=avx2",),
-    prologue=("module load python",),
-    python="/opt/python",
-)
 
 
 @pytest.fixture(scope="module")
@@ -89,47 +69,32 @@ def results(folder: Path) -> list[dict[str, Any]]:
 def test_workers_in_other_folders_give_the_same_table(
     here: list[dict[str, Any]], scheduler: str, tmp_path: Path
 ) -> None:
-    done = evaluated(tmp_path / "out", METHODS, "workers=null", f"cluster.scheduler={scheduler}")
+    done = evaluated(tmp_path / "out", METHODS, "workers=null", f"scheduler={scheduler}")
     assert (done.returncode, done.stderr) == (0, "")
-    assert f"workers of the Dask scheduler at {scheduler}" in done.stdout
     assert results(tmp_path / "out") == here
 
 
-def test_jobs_of_slurm_give_the_same_table(
-    here: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+SBATCH = """#!/usr/bin/env bash
+cp "${*: -1}" "$(dirname "$0")/job"
+setsid bash "$(dirname "$0")/job" >/dev/null 2>&1 &
+echo "Submitted batch job $!"
+"""
+SCANCEL = """#!/usr/bin/env bash
+kill -- "-$1"
+"""
+
+
+def test_jobs_of_slurm_give_the_same_table(here, tmp_path, monkeypatch):
     """SLURM is two scripts here, of which the first starts the job on this machine."""
     for name, text in (("sbatch", SBATCH), ("scancel", SCANCEL)):
         (tmp_path / name).write_text(text)
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))
-    words = ("workers=null", "cluster=slurm", "cluster.interface=lo")
-    done = evaluated(tmp_path / "out", METHODS, *words)
+    monkeypatch.setenv("DASK_JOBQUEUE__SLURM__INTERFACE", "lo")
+    done = evaluated(tmp_path / "out", METHODS, "workers=1", "scheduler=slurm")
     assert (done.returncode, done.stderr) == (0, "")
     assert results(tmp_path / "out") == here
-
-
-def test_a_job_of_slurm_asks_for_what_is_configured() -> None:
-    with slurm_cluster(SLURM) as jobs:
-        script = jobs.job_script()
-    for line in (
-        "#SBATCH -p fast",
-        "#SBATCH -A robots",
-        "#SBATCH -n 1",
-        "#SBATCH --cpus-per-task=8",
-        "#SBATCH --mem=15G",  # 16 GB in units of 2^30 bytes
-        "#SBATCH -t 2:30:00",
-        "#SBATCH --constraint=avx2",
-        "export NUMBA_NUM_THREADS=1",
-        "module load python",
-    ):
-        assert line in script.splitlines()
-    worker = script.splitlines()[-1]
-    assert worker.startswith("/opt/python -m distributed.cli.dask_worker tcp://127.0.0.1:")
-    assert "--nthreads 1 " in worker
-    assert "--nworkers 8 " in worker
-    assert "--preload runners.evaluation.tasks --interface lo" in worker
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere", "ftp://a:1"])
@@ -138,25 +103,22 @@ def test_a_scheduler_that_is_not_there_is_one_line_at_once(
 ) -> None:
     """Without a client of Dask, which waits for a minute when it is given up."""
     monkeypatch.setattr("distributed.Client", lambda *_, **__: pytest.fail("it has a client"))
-    config = LocalConfig(scheduler=address)
     with (
-        pytest.raises(SettingError, match=r"cluster\.scheduler is .*; accepted: the address of"),
-        connected(config, None, print),
+        pytest.raises(SettingError, match=r"scheduler is .*; accepted: the address of"),
+        connected(address, None),
     ):
         pass
 
 
-@pytest.mark.parametrize("dashboard", [True, False])
-def test_nobody_without_the_keys_of_a_run_can_connect(dashboard) -> None:
+def test_nobody_without_the_keys_of_a_run_can_connect() -> None:
     trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # has no key, and asks for none
     trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
-    with connected(LocalConfig(dashboard=dashboard), 1, print) as (client, _):
+    with connected(None, 1) as (client, _):
         for address in (client.cluster.scheduler_address, *client.nthreads()):
             plain = address.replace("tls://", "tcp://")
             for where, keys in ((plain, {}), (address, {"ssl_context": trusting})):
                 with pytest.raises(OSError, match=where):
                     asyncio.run(connect(where, timeout=1, **keys))
-        assert client.cluster.dashboard_link.startswith("http://127.0.0.1:")
 
 
 def wait_until(is_so: Callable[[], bool]) -> None:

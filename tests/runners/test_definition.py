@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet
 import pytest
 
-from chsel.errors import RecordingError, SettingError
+from chsel.errors import SettingError
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_settings import DEFINITIONS, definition_name, plausible_settings
 from chsel.problem.points import KnownPoints
@@ -18,7 +15,6 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import settings_mapping
 from chsel.problem.streams import StreamKey
 from runners.evaluation.metrics import definition_label
-from runners.evaluation.table import ITERATIONS, RESULTS, joined_parts, write_part
 from tests.chsel.plausible.scenes import WORKSPACE, ball
 
 
@@ -61,18 +57,6 @@ def test_wide_definitions_add_up_contacts_or_take_their_mean(name: str, expected
     assert cost == pytest.approx(expected, rel=0.02)
     assert settings.fill_to == 300
     assert settings.cost.tolerance == 0.0
-
-
-@pytest.mark.parametrize("schema", [RESULTS, ITERATIONS], ids=["results", "iterations"])
-def test_parts_by_another_definition_go_into_no_table(tmp_path: Path, schema: pa.Schema) -> None:
-    found = dict.fromkeys(schema.names) | {"method": "icp", "step": 4}
-    one, other = tmp_path / "one.parquet", tmp_path / "other.parquet"
-    write_part(one, [found | {"definition": "paper"}], schema)
-    write_part(other, [found | {"definition": "default"}], schema)
-    with pytest.raises(RecordingError, match=r"other\.parquet has numbers by the def.* default"):
-        joined_parts([one, other], schema, "paper")
-    table = joined_parts([one], schema, "paper")
-    assert table["definition"].to_pylist() == ["paper"]
 
 
 def test_a_definition_that_cannot_be_is_named() -> None:

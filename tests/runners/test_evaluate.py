@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import re
@@ -14,7 +13,6 @@ from glob import glob  # which passes over folders that vanish meanwhile, as Pat
 from pathlib import Path
 from subprocess import PIPE
 
-import pandas as pd
 import psutil
 import pyarrow as pa
 import pyarrow.parquet
@@ -24,6 +22,7 @@ from replay.comparing.verification import EQUAL, verify
 from replay.mcap.reader import read_recording
 from runners import evaluate, plausible, probe
 from runners.command.choices import CONF
+from runners.evaluation.metrics import definition_label
 from runners.evaluation.plan import Plan, Trial
 from runners.reporting.tables import number
 from tests.runners.in_process import Done, run
@@ -39,7 +38,6 @@ SMALL = (
     "definition.grid.rotations=300",
     "definition.grid.upright=4",
     "metrics.points=50",
-    "cluster.dashboard=false",
 )
 METHODS = "methods=[chsel,icp]"
 DEFINITION_OF = {
@@ -59,7 +57,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = evaluated(folder, METHODS)
     assert (done.returncode, done.stderr) == (0, "")
     assert "1 trials, 2 methods, 3 tasks, of which 0 are finished" in done.stdout
-    assert re.search(r"plausible sets: default~\w{8}, cost by means over points, ", done.stdout)
+    assert re.search(r"Plausible sets: default~\w{8}, cost by means over points, ", done.stdout)
     return folder
 
 
@@ -91,7 +89,7 @@ def test_every_experiment_can_be_planned(
     assert plan.contenders
     assert trials
     if path.stem in DEFINITION_OF:
-        assert plan.definition_label == DEFINITION_OF[path.stem]
+        assert definition_label(plan.definition) == DEFINITION_OF[path.stem]
     if path.stem == "anchored_10mm":  # what it is for, beside what it takes from `anchored`
         settings = plan.plausible_settings(0.001)
         assert (settings.cost.tolerance, settings.fill_to) == (0.01, 300)
@@ -121,31 +119,6 @@ def test_the_table_has_a_row_a_registration_that_the_recordings_confirm(folder: 
     for method in ("chsel", "icp"):
         verdicts = list(verify(read_recording(folder / TRIAL / f"{method}.mcap")))
         assert [verdict.outcome for verdict in verdicts] == [EQUAL, EQUAL]
-
-
-def test_what_is_shown_is_medians_by_object_in_mm2_and_milliseconds() -> None:
-    numbers = [("can", "icp", 1.0), ("can", "icp", 2.0), ("can", "icp", 60.0), ("box", "svgd", 7.0)]
-    rows = [
-        {"object": name, "method": method, "diversity": value, "seconds": 0.001 * value}
-        for name, method, value in numbers
-    ]
-    shown = evaluate.median_table(pd.DataFrame(rows), "wide_sums, by sums")
-    assert shown.header == ("method", "box", "can", "ms")
-    assert shown.rows == (("icp", "-", "2", "2"), ("svgd", "7", "-", "7"))
-    assert shown.note == "plausible sets: wide_sums, by sums"
-
-
-def test_csv_and_parquet_are_the_same_table(folder: Path) -> None:
-    results = table(folder)
-    with (folder / "results.csv").open(newline="") as file:
-        texts = list(csv.DictReader(file))
-    assert list(texts[0]) == list(results[0])
-    for text, row in zip(texts, results, strict=True):
-        for name, value in row.items():
-            if value is None:
-                assert text[name] == ""
-            else:
-                assert type(value)(text[name]) == value
 
 
 def test_metrics_are_those_of_runners_plausible(folder: Path) -> None:
@@ -199,32 +172,15 @@ def stamps(folder: Path) -> dict[str, int]:
     ("arguments", "message"),
     [
         (["metrics.points=60"], "metrics.points is 60, was 50"),
-        (["settings.chsel.emitter.iterations=11"], "emitter.iterations is 11, was 10"),
         (["configurations=[mustard,teapot]"], "configurations names 'teapot'; accepted: all"),
         (["seeds=a"], "seeds names 'a'"),
-        (["seeds=9..0"], "seeds names '9..0'"),
-        (["seeds=9223372036854775808"], "seeds names 9223372036854775808"),
         (["steps=99"], "steps is 99; accepted: steps that a configuration has"),
         (["methods=[chsel,chsell]"], "method is 'chsell'"),
-        (["methods=[chsel,chsel]"], "methods has chsel twice"),
         (["methods=[{name:chsel,label:a/b}]"], "'a/b' is not a label"),
-        (["methods=[{name:chsel,label:chsel.iterations}]"], "'chsel.iterations' is not a label"),
-        (["methods=[{name:chsel,setings:{}}]"], "did you mean settings?"),
-        (["methods=[chsel@papper]"], "preset is 'papper'"),
-        (["settings.icp.itterations=1"], "settings.icp.itterations does not exist"),
         (["settings.cpd.iterations=1"], "settings of a method is 'cpd'"),
-        (["steps=x"], "'x' names no steps"),
         (["session=recorded"], "session is 'recorded'; accepted: simulated, kinematic"),
-        (["session.noise=-1"], "noise is -1"),
-        (["metrics.method=fast"], "method is 'fast'"),
-        (["workers=0"], "workers is 0"),
-        (["workers=2", "cluster.scheduler=tcp://127.0.0.1:1"], "workers is 2, which is of this"),
-        (["cluster=slurm", "cluster.jobs=0"], "jobs is 0"),
-        (["cluster=slurm", "cluster.directives=a"], "directives is 'a'; accepted: a list"),
-        (["cluster.shceduler=a"], "did you mean scheduler?"),
+        (["workers=2", "scheduler=tcp://127.0.0.1:1"], "workers are of this machine"),
         (["workers=10000"], "workers is 10000; accepted: an integer from 1 to 256"),
-        (["experiment=smok"], "did you mean smoke?"),
-        (["objects=ycb"], "objects is 'ycb'; accepted: models, scans"),
         (["objects=scans", "assets.dir=nowhere"], "mustard_bottle"),
         (["outside.mine=nowhere"], "nowhere; accepted: a folder"),
         (["outside.icp=."], "outside has icp, as methods has"),
@@ -239,14 +195,6 @@ def test_a_mistake_is_one_line_on_stderr(folder: Path, arguments: list[str], mes
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
     assert stamps(folder) == before
-
-
-def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    done = evaluated(tmp_path / "file" / "out", METHODS)
-    assert done.returncode == 2
-    assert "cannot be written" in done.stderr
-    assert done.stderr.count("\n") == 1
 
 
 def test_jobs_of_a_sweep_share_a_folder(tmp_path: Path) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from filelock import FileLock, Timeout
 
-from runners.evaluation.experiment import LOCK, writing_alone
+from runners.evaluation.experiment import writing_alone
 
 
 def test_a_second_run_in_a_folder_waits_for_the_first(tmp_path: Path) -> None:
-    lock, said = FileLock(tmp_path / LOCK), list[str]()
+    lock, said = FileLock(tmp_path / ".lock"), list[str]()
     lock.acquire()
 
     def end_the_first(line: str) -> None:

@@ -129,8 +129,16 @@ def test_draws_differ_in_their_numbers_alone_and_rank_under_labels_of_their_own(
     methods = ["icp", "icp+1", "package", "package+1"]
     assert sorted(by) == [(method, step) for method in methods for step in (4, 5)]
     assert {row["status"] for row in by.values()} == {"ok"}
-    assert len({by[method, 4]["diversity"] for method in methods}) == 4
-    assert len({by[method, 4]["true_cost"] for method in methods}) == 1
+    for step in (4, 5):
+        assert len({by[method, step]["diversity"] for method in methods}) == 4
+        for name in ("true_cost", "members", "contacts"):  # the session and its set are the same
+            assert len({by[method, step][name] for method in methods}) == 1
+    seeds = {
+        read_recording(folder / f"trials/mustard/seed_0/{name}.mcap").problem(4).key.seed
+        for name in ("icp", "icp+1")
+    }
+    assert len(seeds) == 2
+    assert 0 in seeds
 
 
 def test_what_is_finished_is_not_registered_again_unless_its_session_or_package_is_another(

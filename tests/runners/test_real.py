@@ -74,7 +74,7 @@ def test_rows_have_errors_to_the_pose_and_residuals_of_the_held_out_half(
 
 
 def test_a_case_without_a_true_pose_has_residuals_alone(data: Path, tmp_path: Path) -> None:
-    done = measured(data, tmp_path, "seeds=0", "halves=false", "passes=2", case="unknown")
+    done = measured(data, tmp_path, "seeds=0", "halves=false", case="unknown")
     assert (done.returncode, done.stderr) == (0, "")
     (row,) = rows(tmp_path)
     assert float(row["residual"]) < 0.005

@@ -80,17 +80,6 @@ def test_errors_are_those_of_the_best_hypothesis(scene: Scene) -> None:
     assert (row["hypotheses"], row["distinct"]) == (3, 3)
 
 
-def test_points_are_counted_by_their_class(scene: Scene) -> None:
-    points = scene.problem.points
-    row = scene.rows.row(scene.problem, None, "no reason")
-    assert row["status"] == "failed: no reason"
-    assert row["free_points"] == len(points.free) > 1000
-    assert row["contacts"] == len(points.contacts) == len(points.known) > 0
-    assert row["occupied_points"] == len(points.occupied) == 0
-    probed = [probe.new_points for probe in scene.session.probes() if probe.step <= row["step"]]
-    assert row["contacts"] == sum(len(new.contacts) for new in probed)
-
-
 def test_exact_members_are_those_within_one_epsilon_of_the_true_cost(scene: Scene) -> None:
     stream = np.random.default_rng(0)
     shifts, turns = stream.normal(0.0, 0.003, (4000, 3)), stream.normal(0.0, 0.02, (4000, 3))
