@@ -164,7 +164,7 @@ class McapRecorder(Recorder):
             if len(points) > 0:
                 self._add(topic, step, partial(point_cloud, points))
         self._points = self._points.merged(new)
-        values = {name: len(getattr(self._points, name)) for name in POINT_CLASSES}
+        values: dict[str, Any] = {name: len(getattr(self._points, name)) for name in POINT_CLASSES}
         values |= {f"new_{name}": len(getattr(new, name)) for name in POINT_CLASSES}
         values |= {"step": step, "new_digest": new.digest}
         self._record("/known_points", step, values)

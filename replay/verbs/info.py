@@ -128,7 +128,10 @@ def step_rows(recording: Recording) -> list[dict[str, Any]]:
     points, rows = recording.start.initial_points, []
     for probe in recording.probes:
         points = points.merged(probe.new_points)
-        row = {"step": probe.step, **{name: len(getattr(points, name)) for name in _POINTS}}
+        row: dict[str, Any] = {
+            "step": probe.step,
+            **{name: len(getattr(points, name)) for name in _POINTS},
+        }
         row |= {"posed": probe.step in recording.steps}
         row |= dict.fromkeys(("hypotheses", "distinct", "best_cost"))
         if recording.has_result(probe.step):
