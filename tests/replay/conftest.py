@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
 from contextlib import closing
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -43,9 +41,7 @@ WORKSPACE = Workspace((-0.3, -0.3, 0.0), (0.3, 0.3, 0.5))
 FREE_RESOLUTION = 0.02
 
 
-def example_events(
-    *, steps: int = 3, elites: int = 12, free: int = 40, snapshots: int = 2
-) -> list[Event]:
+def example_events(*, steps=3, elites=12, free=40, snapshots=2):
     """Events of a session with a box; step 0 has a probe in free space and no registration."""
     random = np.random.default_rng(7)
     mesh = trimesh.creation.box((0.1, 0.06, 0.04))
@@ -80,7 +76,7 @@ def example_events(
     return [*events, Logged(steps - 1, "warning", ""), SessionEnded(steps - 1, "finished")]
 
 
-def bare_events() -> list[Event]:
+def bare_events():
     """Events of a session in which all that can be absent or empty is."""
     start = dataclasses.replace(
         example_events(steps=0)[0],
@@ -107,7 +103,7 @@ def bare_events() -> list[Event]:
     ]
 
 
-def with_sensors(events: list[Event]) -> list[Event]:
+def with_sensors(events):
     """The same session of a robot with a camera and a pad: a rig, and images before each probe."""
     random = np.random.default_rng(11)
     hand = trimesh.creation.icosphere(subdivisions=1, radius=0.05)
@@ -127,7 +123,7 @@ def with_sensors(events: list[Event]) -> list[Event]:
     return made
 
 
-def with_decisions(events: list[Event]) -> list[Event]:
+def with_decisions(events):
     """The same session steered: actions are offered, and a decision follows each step's results."""
     random, actions, poses = np.random.default_rng(13), 4, 3
     starting = sum(isinstance(event, SessionStarted | RigDescribed) for event in events)
@@ -139,7 +135,7 @@ def with_decisions(events: list[Event]) -> list[Event]:
     points, probed = start.initial_points, -1
     made: list[Event] = [start, *events[1:starting], ActionsOffered(-1, offered, hand)]
 
-    def decided(*, stop: str = "") -> Decided:
+    def decided(*, stop=""):
         belief = Belief(_poses(random, poses), np.full(poses, 1.0 / poses))
         available = np.arange(actions) != probed
         chosen = -1 if stop else (probed + 1) % actions
@@ -168,17 +164,17 @@ def with_decisions(events: list[Event]) -> list[Event]:
     return made
 
 
-def nth(events: Iterable[Event], kind: type, number: int = 0) -> Any:
+def nth(events, kind, number=0):
     """One of the events of a kind."""
     return [event for event in events if isinstance(event, kind)][number]
 
 
-def changed(events: list[Event], old: Event, **values: Any) -> list[Event]:
+def changed(events, old, **values):
     """The events with other values of one of them."""
     return [dataclasses.replace(event, **values) if event is old else event for event in events]
 
 
-def same_bits(a: Any, b: Any) -> bool:
+def same_bits(a, b):
     """Whether two values are equal down to the types and bytes of their arrays."""
     if hasattr(a, "faces") and hasattr(b, "faces"):  # a mesh, or the shape of a hand
         pairs = [(of.vertices.view(np.ndarray), of.faces.view(np.ndarray)) for of in (a, b)]
@@ -199,11 +195,11 @@ def same_bits(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
-def _poses(random: np.random.Generator, count: int) -> np.ndarray:
+def _poses(random, count):
     return compose(random_rotations(random, count), random.normal(size=(count, 3)))
 
 
-def _probe(random: np.random.Generator, step: int, free: int) -> Probe:
+def _probe(random, step, free):
     contacts = random.normal(size=(step, 3))
     known = np.concatenate([contacts, random.normal(size=(step, 3))])
     new = KnownPoints(
@@ -216,9 +212,7 @@ def _probe(random: np.random.Generator, step: int, free: int) -> Probe:
     return Probe(step, outcome, new, _poses(random, 4), contacts, -contacts)
 
 
-def _registration(
-    random: np.random.Generator, problem: RegistrationProblem, elites: int, snapshots: int
-) -> list[Any]:
+def _registration(random, problem, elites, snapshots):
     step = problem.key.step
     costs = (0.1, np.pi, 1e9)
     events: list[Any] = [
@@ -238,7 +232,7 @@ def _registration(
     return [*events, HypothesesFound(step, found)]
 
 
-def _archive(random: np.random.Generator, iteration: int, elites: int) -> ArchiveSnapshot:
+def _archive(random, iteration, elites):
     return ArchiveSnapshot(
         iteration=iteration,
         refinement=1,
@@ -279,7 +273,7 @@ def any_events(request):
 def assert_same():
     """Asserts that two lists of events are equal to the bit."""
 
-    def check(read: Any, written: Any) -> None:
+    def check(read, written):
         read, written = list(read), list(written)
         assert [type(e).__name__ for e in read] == [type(e).__name__ for e in written]
         for index, (a, b) in enumerate(zip(read, written, strict=True)):
@@ -292,7 +286,7 @@ def assert_same():
 def write(tmp_path):
     """Records events to a new file."""
 
-    def record(events: list[Event]) -> Path:
+    def record(events):
         path = tmp_path / f"{len(list(tmp_path.iterdir()))}.mcap"
         with closing(McapRecorder(path)) as recorder:
             for event in events:

@@ -1,7 +1,5 @@
 """`replay accept`: today's results become the expected ones, if wanted; errors that are shown."""
 
-from __future__ import annotations
-
 import io
 import re
 import shutil
@@ -114,13 +112,13 @@ TRUTH = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(0.8)), np.array([
 BOX = trimesh.creation.box((0.06, 0.1, 0.14)).apply_translation(CENTRE)
 
 
-def turned(degrees: float, shift: float = 0.0) -> np.ndarray:
+def turned(degrees, shift=0.0):
     """object_from_world of the true pose turned about the box's z axis, and shifted along it."""
     rotation = axis_angle(np.array([0.0, 0.0, 1.0]), np.deg2rad(degrees))
     return inverse(TRUTH @ compose(rotation, CENTRE - rotation @ CENTRE + [0.0, 0.0, shift]))
 
 
-def found(*poses: np.ndarray) -> Hypotheses:
+def found(*poses):
     count = len(poses)
     cost, duplicate = np.arange(float(count)), np.zeros(count, dtype=bool)
     stacked = np.array(poses).reshape(-1, 4, 4)

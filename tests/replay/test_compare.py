@@ -1,7 +1,5 @@
 """`compare`: several methods on the recorded problems, under one cost."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import math
@@ -48,7 +46,7 @@ def path(tmp_path_factory):
     return path
 
 
-def rows_of(text: str) -> dict[str, list[str]]:
+def rows_of(text):
     """The cells of the table of medians, by label."""
     cells = [
         re.split(r"\s{2,}", line.strip()) for line in text.split("medians over")[1].split("\n")

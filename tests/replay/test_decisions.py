@@ -1,12 +1,9 @@
 """Decisions of steered sessions: made again, exported, and beside those of other policies."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +14,8 @@ from chsel.problem.poses import axis_angle, compose
 from replay.__main__ import main
 from replay.comparing.choices import POLICY, chosen
 from replay.comparing.differences import result_differences
-from replay.comparing.verification import DIFFERS, EQUAL, Verdict, verify
-from replay.events import Decided, Event, ProblemPosed, SessionStarted
+from replay.comparing.verification import DIFFERS, EQUAL, verify
+from replay.events import Decided, ProblemPosed, SessionStarted
 from replay.mcap.reader import read_recording
 from replay.verbs.compare import policy_decisions
 from replay.verbs.info import recording_info
@@ -31,11 +28,11 @@ def path(steered, write):
     return write(steered)
 
 
-def decided(events: list[Event], step: int) -> Decided:
+def decided(events, step):
     return nth(events, Decided, step + 1)
 
 
-def differing(path: Path) -> list[Verdict]:
+def differing(path):
     return [found for found in verify(read_recording(path)) if found.outcome == DIFFERS]
 
 
@@ -195,7 +192,7 @@ def test_start_and_direction_are_the_hands_place_and_its_z_axis(steered):
     class Recorded:
         start = steered[0]
 
-        def decision(self, _: int) -> Decided:
+        def decision(self, _):
             return dataclasses.replace(of_first, problem=problem)
 
     (row,) = policy_decisions(Recorded(), [], [-1])

@@ -1,11 +1,8 @@
 """`diff`: the first difference between two recordings, and all of them."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re
-from pathlib import Path
 
 import numpy as np
 import trimesh
@@ -25,7 +22,7 @@ from replay.verbs.diff import FIRST, SECOND, recording_diff
 from tests.replay.conftest import changed, nth
 
 
-def texts(first: Path, second: Path, *ignored: str) -> list[str]:
+def texts(first, second, *ignored):
     return [str(item) for item in recording_diff(first, second, ignored).differences]
 
 
@@ -80,7 +77,7 @@ def test_an_event_too_many_shifts_nothing(events, write):
 
 
 def test_signed_zeros_differ_and_equal_nan_do_not(events, write):
-    def with_values(*values: float) -> Path:
+    def with_values(*values):
         numbers = {f"number_{index}": value for index, value in enumerate(values)}
         return write(changed(events, nth(events, Measured), values=numbers))
 

@@ -29,7 +29,7 @@ def recording(events, write):
     return read_recording(write(events))
 
 
-def exported(recording, what: str, file_format: str, *more: str) -> Path:
+def exported(recording, what, file_format, *more):
     """The file that the command writes."""
     path = recording.path.with_name(f"out.{file_format}")
     path.unlink(missing_ok=True)
@@ -37,18 +37,18 @@ def exported(recording, what: str, file_format: str, *more: str) -> Path:
     return path
 
 
-def table(recording, what: str, *more: str) -> list[dict[str, str]]:
+def table(recording, what, *more):
     with exported(recording, what, "csv", *more).open(newline="") as file:
         return list(csv.DictReader(file))
 
 
-def arrays(recording, what: str, *more: str) -> dict[str, Any]:
+def arrays(recording, what, *more):
     with np.load(exported(recording, what, "npz", *more), allow_pickle=False) as archive:
         return {name: archive[name] for name in archive.files}
 
 
-def standard_json(recording, what: str) -> Any:
-    def refuse(name: str):
+def standard_json(recording, what):
+    def refuse(name):
         raise AssertionError(f"{name} is no JSON")
 
     return json.loads(exported(recording, what, "json").read_text(), parse_constant=refuse)

@@ -1,7 +1,5 @@
 """Stored replays as items of pytest, and what is stored."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shutil
@@ -31,7 +29,7 @@ def _numba_as_a_whole():
     assert numba.njit(abs_of)(-1.0) == 1.0
 
 
-def abs_of(number: float) -> float:
+def abs_of(number):
     """Anything to compile."""
     return abs(number)
 

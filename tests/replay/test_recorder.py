@@ -36,7 +36,7 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
 class Gate:
     """Notes what it gets once its gate is open; fails at the events that `fails_at` names."""
 
-    def __init__(self, *fails_at: object, is_open: bool = True) -> None:
+    def __init__(self, *fails_at, is_open=True):
         self.calls: list[object] = []
         self.threads: set[threading.Thread] = set()
         self.gate = threading.Event()
@@ -44,16 +44,16 @@ class Gate:
         if is_open:
             self.gate.set()
 
-    def record(self, event: object) -> None:
+    def record(self, event):
         self._note(event)
 
-    def flush(self) -> None:
+    def flush(self):
         self._note("flush")
 
-    def close(self) -> None:
+    def close(self):
         self._note("close")
 
-    def _note(self, call: object) -> None:
+    def _note(self, call):
         assert self.gate.wait(60)
         self.calls.append(call)
         self.threads.add(threading.current_thread())
@@ -82,7 +82,7 @@ def test_who_records_faster_than_the_pictures_are_drawn_has_to_wait():
     pictures = Gate(is_open=False)
     recorder = Recorders([], pictures)
 
-    def record() -> None:
+    def record():
         for event in range(1000):
             recorder.record(event)
 
@@ -163,7 +163,7 @@ class Synced:
     sizes: dict[int, int] = field(default_factory=dict)
     names: dict[int, list[str]] = field(default_factory=dict)
 
-    def holds(self, path: Path) -> bool:
+    def holds(self, path):
         """Whether a file as it is now, and then its name, are on the disk."""
         there = path.stat()
         named = path.name in self.names.get(path.parent.stat().st_ino, [])
@@ -175,7 +175,7 @@ def synced(monkeypatch):
     """Follows os.fsync."""
     found = Synced()
 
-    def fsync(number: int) -> None:
+    def fsync(number):
         there = os.fstat(number)
         if os.path.isdir(f"/proc/self/fd/{number}"):
             found.names[there.st_ino] = os.listdir(number)

@@ -1,14 +1,11 @@
 """`replay verify`: equal bits, the smallest difference, files that cannot be used."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +13,8 @@ import pytest
 
 from replay.__main__ import main
 from replay.comparing.differences import is_close
-from replay.comparing.verification import DIFFERS, EQUAL, NO_RESULT, Verdict, verified_files, verify
-from replay.events import Event, HypothesesFound, Measured, SessionStarted, Traced
+from replay.comparing.verification import DIFFERS, EQUAL, NO_RESULT, verified_files, verify
+from replay.events import HypothesesFound, Measured, SessionStarted, Traced
 from replay.mcap.reader import read_recording
 from tests.replay.conftest import changed, nth
 from tests.tools.small_recordings import registered_session
@@ -33,13 +30,13 @@ def descent():
     return registered_session("gradient_descent")
 
 
-def measured(events: list[Event], step: int, change: Callable[[str, float], float]) -> list[Event]:
+def measured(events, step, change):
     """The events with other measured values of a step."""
     old = nth(events, Measured, step)
     return changed(events, old, values={name: change(name, x) for name, x in old.values.items()})
 
 
-def verdicts(path: Path) -> list[Verdict]:
+def verdicts(path):
     return list(verify(read_recording(path)))
 
 
@@ -176,7 +173,7 @@ LINE = "value = scale * excess"
 PLANTED = "value = 1.0000000000001 * scale * excess"
 
 
-def verified(folder: Path, **changes: str) -> subprocess.CompletedProcess[str]:
+def verified(folder, **changes):
     """`replay verify` with the packages in a folder."""
     recording = REPLAYS / "spam_can_gradient_descent.mcap"
     return subprocess.run(

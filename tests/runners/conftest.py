@@ -1,7 +1,5 @@
 """What tests of commands need before they start."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np
@@ -12,7 +10,7 @@ from chsel.methods import METHODS
 
 
 @pytest.fixture(scope="session", autouse=True)
-def compiled_kernels() -> None:
+def compiled_kernels():
     """The kernels, compiled, so that no command says on stderr that it compiles them."""
     nodes = np.indices((9, 9, 9)) * 0.01 - 0.04
     radius = np.sqrt((nodes**2).sum(axis=0))

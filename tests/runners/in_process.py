@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import sys
 import warnings
-from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 
@@ -13,7 +12,6 @@ import pytest
 from hydra._internal.hydra import Hydra
 
 from runners.evaluation import tasks
-from runners.evaluation.plan import Plan, Task
 from runners.run.session_run import one_line
 
 
@@ -26,7 +24,7 @@ class Done:
     stderr: str
 
 
-def run(program: Callable[[], None], *arguments: str, columns: int = 160) -> Done:
+def run(program, *arguments, columns=160):
     """Run a command as a shell would, on a terminal of so many columns.
 
     Hydra would compose its configuration twice, first to see whether it has a hydra.mode.
@@ -45,7 +43,7 @@ def run(program: Callable[[], None], *arguments: str, columns: int = 160) -> Don
     return Done(status, out.getvalue(), errors.getvalue())
 
 
-def do_task(plan: Plan, task: Task) -> str:
+def do_task(plan, task):
     """Do a task of an evaluation in this process; the reason why it failed, "" if it did not."""
     try:
         tasks.do_task(plan, task)

@@ -1,9 +1,6 @@
 """Folders of evaluations with made-up numbers, as runners.evaluate leaves them."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +22,13 @@ DEFINITION = {
 }
 
 
-def row(configuration: str, seed: int, method: str, step: int | None, **numbers: Any) -> Row:
+def row(configuration, seed, method, step, **numbers):
     """A registration that has gone well; numbers: by the names of the columns."""
     found = {"object": configuration.split("_")[0], "configuration": configuration, "seed": seed}
     return {**found, "method": method, "preset": "default", "step": step, "status": "ok", **numbers}
 
 
-def write_evaluation(
-    folder: Path,
-    rows: Sequence[Row] | None,
-    iterations: Sequence[Row] | None = None,
-    **experiment: Any,
-) -> Path:
+def write_evaluation(folder, rows, iterations=None, **experiment):
     """A folder with these tables; None: without the table."""
     folder.mkdir(parents=True, exist_ok=True)
     described = {
@@ -60,12 +52,12 @@ def write_evaluation(
     return folder
 
 
-def write_table(path: Path, rows: Sequence[Row], schema: pa.Schema | None = RESULTS) -> None:
+def write_table(path, rows, schema=RESULTS):
     """Rows as a table; what they do not have is null."""
     pa.parquet.write_table(pa.Table.from_pylist(list(rows), schema=schema), path)
 
 
-def tables_of(folder: Path, baseline: str | None = None) -> dict[str, list[list[str]]]:
+def tables_of(folder, baseline=None):
     """The tables of a report by their titles, with their headers, without what is bold."""
     sections = sections_of(open_evaluation(folder), baseline)
     return {
@@ -77,9 +69,7 @@ def tables_of(folder: Path, baseline: str | None = None) -> dict[str, list[list[
     }
 
 
-def session(
-    configuration: str, seed: int, policy: str, errors: Sequence[float], **columns: Sequence[Any]
-) -> list[Row]:
+def session(configuration, seed, policy, errors, **columns):
     """A row per probe. errors: millimetres. columns: further ones, a value for each probe."""
     about = {"object": configuration.split("_")[0], "configuration": configuration, "seed": seed}
     about |= {"policy": policy, "method": "anchored", "preset": "default", "faults": "clean"}
@@ -100,7 +90,7 @@ def session(
     ]
 
 
-def write_sessions(folder: Path, rows: Sequence[Row], budgets: Mapping[str, int | None]) -> Path:
+def write_sessions(folder, rows, budgets):
     """A folder with these rows. budgets: probes of a session, by policy."""
     policies = {
         name: {"name": name, "settings": {"probes": probes}} for name, probes in budgets.items()

@@ -1,9 +1,6 @@
 """The command that finds where the object of real data is, as a user runs it."""
 
-from __future__ import annotations
-
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +18,7 @@ from runners.objects.loader import load_model
 from runners.sensors.pose_file import beside, read_pose
 from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
-from tests.runners.in_process import Done, run
+from tests.runners.in_process import run
 
 YAW = 0.5
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(YAW)), np.array([0.1, 0.2, 0.3]))
@@ -31,7 +28,7 @@ SETS = ("definition.grid.rotations=200", "definition.grid.upright=0")
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(tmp_path_factory):
     """A recording of points on a box whose pose nobody told."""
     folder = tmp_path_factory.mktemp("align")
     box = trimesh.creation.box((0.1, 0.06, 0.2))
@@ -58,18 +55,18 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def path(recorded: Path, tmp_path: Path) -> Path:
+def path(recorded, tmp_path):
     """The same, where nothing else is yet."""
     path = tmp_path / "session.mcap"
     shutil.copyfile(recorded, path)
     return path
 
 
-def aligned(path: Path, *arguments: str) -> Done:
+def aligned(path, *arguments):
     return run(align.main, str(path), *SEARCH, *arguments)
 
 
-def test_the_pose_is_found_near_a_guess_and_written_with_a_picture(path: Path) -> None:
+def test_the_pose_is_found_near_a_guess_and_written_with_a_picture(path):
     done = aligned(path, *NEAR)
     assert (done.returncode, done.stderr) == (0, "")
     assert sorted(file.name for file in path.parent.iterdir()) == [
@@ -97,7 +94,7 @@ def test_the_pose_is_found_near_a_guess_and_written_with_a_picture(path: Path) -
     assert "warning" not in done.stdout
 
 
-def test_the_found_pose_is_the_next_guess_and_what_is_there_stays(path: Path) -> None:
+def test_the_found_pose_is_the_next_guess_and_what_is_there_stays(path):
     assert aligned(path, *NEAR).returncode == 0
     there = path.with_name("session.pose.yaml")
     before = there.read_bytes()
@@ -112,7 +109,7 @@ def test_the_found_pose_is_the_next_guess_and_what_is_there_stays(path: Path) ->
     assert about["cost"] <= about["guess_cost"]
 
 
-def test_plausible_sets_are_made_around_the_pose_beside_a_recording(path: Path) -> None:
+def test_plausible_sets_are_made_around_the_pose_beside_a_recording(path):
     refused = run(plausible.main, str(path), *SETS)
     assert refused.returncode == 2
     assert refused.stderr.count("\n") == 1
@@ -124,7 +121,7 @@ def test_plausible_sets_are_made_around_the_pose_beside_a_recording(path: Path) 
     assert f"around ({x:.3f}, {y:.3f}, {z:.3f}) m" in done.stdout
 
 
-def test_a_raw_log_is_read_first_and_its_object_is_named(tmp_path: Path) -> None:
+def test_a_raw_log_is_read_first_and_its_object_is_named(tmp_path):
     pytest.importorskip("pybullet")
     from runners.simulated_robot.simulation import simulate_log
 
@@ -156,9 +153,7 @@ def test_a_raw_log_is_read_first_and_its_object_is_named(tmp_path: Path) -> None
         (("pose=none.yaml",), "pose file none.yaml: cannot be read"),
     ],
 )
-def test_what_cannot_be_searched_is_one_line(
-    path: Path, arguments: tuple[str, ...], message: str
-) -> None:
+def test_what_cannot_be_searched_is_one_line(path, arguments, message):
     done = run(align.main, str(path), *arguments)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert message in done.stderr

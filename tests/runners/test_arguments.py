@@ -1,10 +1,7 @@
 """Files whose names Hydra would read as its own grammar, as they are typed in a shell."""
 
-from __future__ import annotations
-
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -30,15 +27,15 @@ COARSE = (
 )
 
 
-def value_of(word: str) -> object:
+def value_of(word):
     """What a setting becomes in Hydra's configuration."""
     override = OverridesParser.create().parse_override(word)
     assert not override.is_sweep_override()
     config = OmegaConf.create({"seed": 7, "path": override.value()})
-    return OmegaConf.to_container(config, resolve=True)["path"]  # type: ignore[index,call-overload]
+    return OmegaConf.to_container(config, resolve=True)["path"]
 
 
-def test_a_path_reaches_the_configuration_as_typed() -> None:
+def test_a_path_reaches_the_configuration_as_typed():
     for name in NAMES:
         for key in ("object.path", "++session.hand.urdf", "+outside.x"):
             (word,) = hydra_arguments("probe", [f"{key}={name}"])
@@ -47,9 +44,7 @@ def test_a_path_reaches_the_configuration_as_typed() -> None:
         assert value_of(f"x={quoted(name)}") == name
 
 
-def test_the_home_folder_is_put_in_and_what_hydra_reads_stays(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_home_folder_is_put_in_and_what_hydra_reads_stays(monkeypatch):
     monkeypatch.setenv("HOME", "/home/somebody")
     words = ["object.path=~/a,b [1].obj", "assets.dir=~", "session.rig.hand.urdf=~/a b.urdf"]
     assert [value_of(word) for word in hydra_arguments("probe", words)] == [
@@ -64,7 +59,7 @@ def test_the_home_folder_is_put_in_and_what_hydra_reads_stays(
 
 
 @pytest.fixture
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def home(tmp_path, monkeypatch):
     """A home folder with a mesh and points of strange names."""
     monkeypatch.setenv("HOME", str(tmp_path))
     box = trimesh.creation.box((0.1, 0.06, 0.2))
@@ -76,9 +71,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_a_session_of_strange_files_runs_from_the_command_to_the_replay(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_session_of_strange_files_runs_from_the_command_to_the_replay(home, monkeypatch):
     monkeypatch.chdir(home)
     done = run(
         probe.main,
@@ -98,9 +91,7 @@ def test_a_session_of_strange_files_runs_from_the_command_to_the_replay(
     assert list((home / "s,1").iterdir())
 
 
-def test_words_without_a_key_get_that_of_the_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_words_without_a_key_get_that_of_the_command(tmp_path, monkeypatch):
     assert hydra_arguments("report", ["a b", "out=x", "--traceback"]) == ["out=x", "dir='a b'"]
     assert hydra_arguments("align", ["-cd", "x", "f.mcap"]) == ["-cd", "x", "file='f.mcap'"]
     assert hydra_arguments("plausible", ["f", "3", "5..9"]) == ["file='f'", "steps='3,5..9'"]
@@ -112,7 +103,7 @@ def test_words_without_a_key_get_that_of_the_command(
     assert hydra_arguments("plausible", ["seed=1"]) == ["file='seed=1'"]
 
 
-def test_any_key_of_an_open_group_is_taken() -> None:
+def test_any_key_of_an_open_group_is_taken():
     words = ["settings.icp.iterations=3", "outside.mine=x [1]", "seeds=0"]
     assert hydra_arguments("evaluate", words) == [
         "++settings.icp.iterations=3",
@@ -130,9 +121,7 @@ def test_any_key_of_an_open_group_is_taken() -> None:
         ("settings=null", "settings is None; accepted: a group of settings by method"),
     ],
 )
-def test_settings_of_methods_are_taken_dotted_and_as_a_group(
-    command: Callable[[], None], word: str, message: str, tmp_path: Path
-) -> None:
+def test_settings_of_methods_are_taken_dotted_and_as_a_group(command, word, message, tmp_path):
     (tmp_path / "real").mkdir()
     folders = [f"data={tmp_path}"] if command is real.main else ["session=kinematic"]
     done = run(command, word, *folders, f"out={tmp_path / 'out'}")

@@ -8,14 +8,12 @@ import subprocess
 import sys
 import venv
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from chsel.problem.poses import apply, inverse
-from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import mesh_sdf
 from runners import benchmark
 from runners.benchmarks.benchmark_report import slower
@@ -38,24 +36,24 @@ from tests.runners.in_process import run as in_process
 FEW = ("quick=true", "repeats=2")
 
 
-def run(logs: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
+def run(logs, *overrides):
     command = [sys.executable, "-m", "runners.benchmark", *FEW, *overrides, f"logs={logs}"]
     environment = {**os.environ, "COLUMNS": "80", "OMP_NUM_THREADS": "1"}
     return subprocess.run(command, capture_output=True, text=True, env=environment)
 
 
-def found(logs: Path) -> tuple[Path, list[dict[str, Any]]]:
+def found(logs):
     (folder,) = (logs / "benchmark").iterdir()
     return folder, json.loads((folder / "benchmark.json").read_text())["rows"]
 
 
 @pytest.fixture(scope="module")
-def problem() -> RegistrationProblem:
+def problem():
     return pose(Problem(contacts=7, free_points=3000, hypotheses=4), seed=3)
 
 
 @pytest.fixture(scope="module")
-def stand_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def stand_in(tmp_path_factory):
     """An interpreter with packages that have the published ones' names and interface."""
     folder = tmp_path_factory.mktemp("stand_in")
     venv.create(folder, symlinks=True)
@@ -142,7 +140,7 @@ class CachedSDF:
 """
 
 
-def test_free_points_are_a_lattice_around_the_object_and_contacts_touch_it() -> None:
+def test_free_points_are_a_lattice_around_the_object_and_contacts_touch_it():
     posed, (mesh, _) = pose(PROBLEMS["real_20"], seed=0), drill(1.0)
     points, object_from_world = posed.points, inverse(standing(mesh))
     assert mesh_sdf(mesh, apply(object_from_world, points.free))[0].min() > 0.0
@@ -154,7 +152,7 @@ def test_free_points_are_a_lattice_around_the_object_and_contacts_touch_it() -> 
     assert ((points.free >= lower - 1e-9) & (points.free <= upper + 1e-9)).all()
 
 
-def test_the_package_reads_the_nodes_of_our_grid(problem: RegistrationProblem) -> None:
+def test_the_package_reads_the_nodes_of_our_grid(problem):
     grid, bounds = problem.sdf, np.array([[-0.1, -0.2, -0.3], [0.4, 0.5, 0.6]])
     values = {"sdf_values": grid.values, "sdf_gradients": grid.gradients, "object_bounds": bounds}
     sdf = GridSdf({**values, "sdf_origin": grid.origin, "sdf_resolution": grid.resolution})
@@ -168,10 +166,10 @@ def test_the_package_reads_the_nodes_of_our_grid(problem: RegistrationProblem) -
     np.testing.assert_allclose(box.T, bounds + np.array([[-0.1], [0.1]]), rtol=1e-6)
 
 
-def test_measurements_alternate_and_rows_tell_their_middle() -> None:
+def test_measurements_alternate_and_rows_tell_their_middle():
     order: list[str] = []
 
-    def measure(name: str, value: float) -> float:
+    def measure(name, value):
         order.append(name)
         return value + len(order)
 
@@ -184,7 +182,7 @@ def test_measurements_alternate_and_rows_tell_their_middle() -> None:
     assert (row.median, row.quartiles) == (3.0, (2.0, 4.0))
 
 
-def test_ratios_are_of_the_same_problem() -> None:
+def test_ratios_are_of_the_same_problem():
     ours, package, other = (
         Row("registration", case, who, "ms", (taken,))
         for case, who, taken in (
@@ -198,9 +196,7 @@ def test_ratios_are_of_the_same_problem() -> None:
     assert slower(rows, package, "package") is slower(rows, other, "package") is None
 
 
-def test_the_worker_does_all_steps_of_the_package_and_counts_them(
-    stand_in: Path, problem: RegistrationProblem
-) -> None:
+def test_the_worker_does_all_steps_of_the_package_and_counts_them(stand_in, problem):
     with PublishedPackage(stand_in) as package:
         assert package.versions["chsel"] == "0.2.1"
         package.load(problem, drill(1.0)[0].bounds)
@@ -217,7 +213,7 @@ def test_the_worker_does_all_steps_of_the_package_and_counts_them(
         package.load(problem, drill(1.0)[0].bounds)  # an error ends nothing
 
 
-def test_every_measure_of_this_library_alone_is_in_the_file_and_shown(tmp_path: Path) -> None:
+def test_every_measure_of_this_library_alone_is_in_the_file_and_shown(tmp_path):
     measures = "alone=[stages,threads,plausible_sets]"
     done = run(tmp_path, "package.skip=true", measures)
     assert done.returncode == 0, done.stderr
@@ -237,7 +233,7 @@ def test_every_measure_of_this_library_alone_is_in_the_file_and_shown(tmp_path: 
     assert (folder / "speed.md").read_text().endswith(done.stdout.partition("written: ")[0])
 
 
-def test_with_the_package_it_is_measured_in_the_same_run(stand_in: Path, tmp_path: Path) -> None:
+def test_with_the_package_it_is_measured_in_the_same_run(stand_in, tmp_path):
     done = run(tmp_path, f"package.python={stand_in}", "alone=[]")
     assert done.returncode == 0, done.stderr
     _, rows = found(tmp_path)
@@ -260,7 +256,7 @@ def test_with_the_package_it_is_measured_in_the_same_run(stand_in: Path, tmp_pat
         ("steps.adam=0", "adam is 0; accepted"),
     ],
 )
-def test_a_mistake_is_one_line_and_status_2(tmp_path: Path, override: str, message: str) -> None:
+def test_a_mistake_is_one_line_and_status_2(tmp_path, override, message):
     words = override.replace("DIR", str(tmp_path / "environment")).split()
     done = in_process(benchmark.main, *FEW, *words, f"logs={tmp_path / 'logs'}")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)

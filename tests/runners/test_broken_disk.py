@@ -1,18 +1,15 @@
 """Disks that fail under a run: one clear error, status 2, and the recording so far intact."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from replay.__main__ import main as replay_main
-from replay.mcap.reader import Recording, read_recording
+from replay.mcap.reader import read_recording
 from tests.tools.kill_sessions import points_session, reported_probes
 
 pytestmark = pytest.mark.slow
@@ -21,19 +18,17 @@ TIMEOUT = 120
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
+def session(tmp_path_factory):
     """The overrides of a session whose archives grow to megabytes."""
     overrides = points_session(tmp_path_factory.mktemp("points"))
     quick = ("method=chsel", "method.descent.restarts=2", "method.descent.iterations=20")
     return (*overrides, *quick, "method.archive.bins=400", "method.emitter.iterations=200")
 
 
-def start(
-    logs: Path, *overrides: str, limit: int | None = None, stdout: int = subprocess.PIPE
-) -> subprocess.Popen[str]:
+def start(logs, *overrides, limit=None, stdout=subprocess.PIPE):
     """The command, with a limit on the size of files in bytes."""
 
-    def set_limit() -> None:
+    def set_limit():
         if limit is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
@@ -47,12 +42,12 @@ def start(
     )
 
 
-def run_folder(logs: Path) -> Path:
+def run_folder(logs):
     (folder,) = (logs / "probe").iterdir()
     return folder
 
 
-def only_error(errors: str) -> str:
+def only_error(errors):
     """The one error among the lines; what is said of the pictures besides is a warning."""
     lines = errors.splitlines()
     assert all(line.startswith(("warning: ", "compiling the kernels")) for line in lines[:-1]), (
@@ -62,15 +57,13 @@ def only_error(errors: str) -> str:
     return lines[-1]
 
 
-def recovered(path: Path) -> Recording:
+def recovered(path):
     out = path.with_name("recovered.mcap")
     assert replay_main(["recover", str(path), "-o", str(out)]) == 0
     return read_recording(out)
 
 
-def test_a_full_disk_is_one_error_and_every_reported_probe_stays(
-    session: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_full_disk_is_one_error_and_every_reported_probe_stays(session, tmp_path):
     process = start(tmp_path, *session, "recording=both", limit=1_200_000)
     output, errors = process.communicate(timeout=TIMEOUT)
     assert process.returncode == 2
@@ -83,9 +76,7 @@ def test_a_full_disk_is_one_error_and_every_reported_probe_stays(
     assert json.loads((folder / "summary.json").read_text())["outcome"] == f"failed: {reason}"
 
 
-def test_a_disk_that_is_full_for_the_pictures_alone_is_told(
-    session: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_disk_that_is_full_for_the_pictures_alone_is_told(session, tmp_path):
     process = start(tmp_path, *session, "recording=rerun", limit=500_000)
     _, errors = process.communicate(timeout=TIMEOUT)
     assert process.returncode == 2
@@ -95,9 +86,7 @@ def test_a_disk_that_is_full_for_the_pictures_alone_is_told(
     )
 
 
-def test_output_that_nobody_reads_ends_the_run_with_a_whole_recording(
-    session: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_output_that_nobody_reads_ends_the_run_with_a_whole_recording(session, tmp_path):
     """As with `| head`: no error is printed, and the status is that of a broken pipe."""
     process = start(tmp_path, *session, "recording=both")
     assert process.stdout is not None

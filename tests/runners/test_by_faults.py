@@ -1,9 +1,5 @@
 """Evaluations of sessions with faults: their rows, tables and picture."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pandas as pd
 import pytest
 
@@ -25,7 +21,7 @@ FAULTY = Trial(0, "mustard+noise_3mm")
 HELD = "Steps with the true pose in the set"
 
 
-def test_configurations_and_levels_of_faults_have_names() -> None:
+def test_configurations_and_levels_of_faults_have_names():
     found = configurations_of("kinematic")
     assert list(found)[:2] == ["drill", "drill+noise_1mm"]
     faulty = found["box_fallen+mixed"]
@@ -37,9 +33,7 @@ def test_configurations_and_levels_of_faults_have_names() -> None:
     assert chosen_names("faults", ["noise_*", "clean"], LEVELS)[:2] == ("clean", "noise_1mm")
 
 
-def test_without_plausible_sets_there_is_no_pd_but_the_distance_from_the_truth(
-    tmp_path: Path,
-) -> None:
+def test_without_plausible_sets_there_is_no_pd_but_the_distance_from_the_truth(tmp_path):
     plan = plan_in(tmp_path / "out", steps="5", plausible=False)
     join_experiment(plan, "test", [FAULTY.configuration], [0])
     for task in (Task(FAULTY), Task(FAULTY, "icp")):
@@ -61,15 +55,13 @@ def test_without_plausible_sets_there_is_no_pd_but_the_distance_from_the_truth(
         (["session=kinematic", "session.faults.contact_noise=0.001"], "accepted here: faults="),
     ],
 )
-def test_faults_that_cannot_be_evaluated_are_one_line(
-    tmp_path: Path, arguments: list[str], message: str
-) -> None:
+def test_faults_that_cannot_be_evaluated_are_one_line(tmp_path, arguments, message):
     done = run(evaluate.main, f"out={tmp_path}", *arguments)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert message in done.stderr
 
 
-def test_the_interval_of_a_share_is_wilsons() -> None:
+def test_the_interval_of_a_share_is_wilsons():
     flags = {"most": [True] * 9 + [False, None], "none": [False] * 5, "all": [True] * 5}
     rows = [{"of": of, "held": held} for of, some in flags.items() for held in some]
     found = shares(pd.DataFrame(rows), "of", "held")
@@ -82,7 +74,7 @@ def test_the_interval_of_a_share_is_wilsons() -> None:
 
 
 @pytest.fixture
-def made_up(tmp_path: Path) -> Path:
+def made_up(tmp_path):
     """Two levels; "own" tells whether it holds the truth, in all 4 steps and in 1 of 4."""
     rows = []
     for level, count in (("clean", 4), ("mixed", 1)):
@@ -94,7 +86,7 @@ def made_up(tmp_path: Path) -> Path:
     return write_evaluation(tmp_path / "evaluation", rows)
 
 
-def test_tables_have_a_line_a_level_and_one_of_all(made_up: Path) -> None:
+def test_tables_have_a_line_a_level_and_one_of_all(made_up):
     tables = tables_of(made_up)
     assert tables[HELD] == [
         ["faults", "own"],
@@ -109,7 +101,7 @@ def test_tables_have_a_line_a_level_and_one_of_all(made_up: Path) -> None:
     assert tables["PD in mm²"][3][:2] == ["all levels", "8"]
 
 
-def test_evaluations_without_faults_have_no_such_section(tmp_path: Path) -> None:
+def test_evaluations_without_faults_have_no_such_section(tmp_path):
     folder = write_evaluation(tmp_path, [row("can", 0, "icp", 4, diversity=1.0)])
     evaluation = open_evaluation(folder)
     assert tables_by_faults(evaluation.rows, styles_of(evaluation.methods)) == []

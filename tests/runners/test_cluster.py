@@ -1,7 +1,5 @@
 """Evaluations on workers in other folders: a scheduler started by hand, and jobs of SLURM."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import os
@@ -9,10 +7,8 @@ import ssl
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import pyarrow.parquet
 import pytest
@@ -27,7 +23,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
-def here(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+def here(tmp_path_factory):
     """The table of an evaluation by workers of this machine."""
     folder = tmp_path_factory.mktemp("here")
     assert evaluated(folder, METHODS).returncode == 0
@@ -35,14 +31,14 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
 
 
 @pytest.fixture
-def scheduler(tmp_path: Path) -> Iterator[str]:
+def scheduler(tmp_path):
     """The address of a scheduler with two workers, each in a folder of its own."""
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     file = tmp_path / "scheduler.json"
     where = ["--scheduler-file", str(file)]
     with ExitStack() as stack:
 
-        def start(name: str, *arguments: str) -> None:
+        def start(name, *arguments):
             (tmp_path / name).mkdir()
             process = subprocess.Popen(
                 [sys.executable, "-m", f"distributed.cli.dask_{arguments[0]}", *arguments[1:]],
@@ -60,15 +56,13 @@ def scheduler(tmp_path: Path) -> Iterator[str]:
         yield json.loads(file.read_text())["address"]
 
 
-def results(folder: Path) -> list[dict[str, Any]]:
+def results(folder):
     """The rows but for the time that they took."""
     rows = pyarrow.parquet.read_table(folder / "results.parquet").to_pylist()
     return [{**row, "seconds": None} for row in rows]
 
 
-def test_workers_in_other_folders_give_the_same_table(
-    here: list[dict[str, Any]], scheduler: str, tmp_path: Path
-) -> None:
+def test_workers_in_other_folders_give_the_same_table(here, scheduler, tmp_path):
     done = evaluated(tmp_path / "out", METHODS, "workers=null", f"scheduler={scheduler}")
     assert (done.returncode, done.stderr) == (0, "")
     assert results(tmp_path / "out") == here
@@ -98,9 +92,7 @@ def test_jobs_of_slurm_give_the_same_table(here, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere", "ftp://a:1"])
-def test_a_scheduler_that_is_not_there_is_one_line_at_once(
-    address: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scheduler_that_is_not_there_is_one_line_at_once(address, monkeypatch):
     """Without a client of Dask, which waits for a minute when it is given up."""
     monkeypatch.setattr("distributed.Client", lambda *_, **__: pytest.fail("it has a client"))
     with (
@@ -110,7 +102,7 @@ def test_a_scheduler_that_is_not_there_is_one_line_at_once(
         pass
 
 
-def test_nobody_without_the_keys_of_a_run_can_connect() -> None:
+def test_nobody_without_the_keys_of_a_run_can_connect():
     trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # has no key, and asks for none
     trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
     with connected(None, 1) as (client, _):
@@ -121,7 +113,7 @@ def test_nobody_without_the_keys_of_a_run_can_connect() -> None:
                     asyncio.run(connect(where, timeout=1, **keys))
 
 
-def wait_until(is_so: Callable[[], bool]) -> None:
+def wait_until(is_so):
     latest = time.monotonic() + 120.0
     while not is_so():
         assert time.monotonic() < latest

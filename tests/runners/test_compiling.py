@@ -1,7 +1,5 @@
 """All kernels are there before the first probe, and a line says so."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -46,7 +44,7 @@ QUICK = ("method.descent.restarts=1", "method.descent.iterations=5", "method.emi
 
 
 @pytest.fixture(scope="module")
-def points(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
+def points(tmp_path_factory):
     """A session of three steps on a box, with points of every class."""
     folder = tmp_path_factory.mktemp("points")
     box = trimesh.creation.box((0.1, 0.06, 0.2))
@@ -76,8 +74,8 @@ def points(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
     ids=lambda choice: choice[0],
 )
 def test_a_session_needs_no_kernel_that_is_not_there_before_its_first_probe(
-    choice: tuple[str, ...], points: tuple[str, ...], tmp_path: Path
-) -> None:
+    choice, points, tmp_path
+):
     command = [sys.executable, "-c", SESSION, *points, *choice, f"logs={tmp_path}"]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
@@ -88,11 +86,11 @@ def test_a_session_needs_no_kernel_that_is_not_there_before_its_first_probe(
     assert more == "[]"
 
 
-def test_the_line_counts_and_stays(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_line_counts_and_stays(capsys):
     with compiling_line():
         for _ in range(2):
 
-            def kernel(x: float) -> float:
+            def kernel(x):
                 return x + 1.0
 
             kernel.__module__ = "chsel.made_up"
@@ -102,9 +100,7 @@ def test_the_line_counts_and_stays(capsys: pytest.CaptureFixture[str]) -> None:
     assert shown.err == ""
 
 
-def test_a_first_session_compiles_before_its_first_probe(
-    points: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_first_session_compiles_before_its_first_probe(points, tmp_path):
     command = [sys.executable, "-m", "runners.probe", *points, "method=icp", f"logs={tmp_path}"]
     environment = {**os.environ, "CHSEL_CACHE_DIR": str(tmp_path / "kept"), "OMP_NUM_THREADS": "2"}
     environment["PYTHONPATH"] = str(REPOSITORY)

@@ -1,9 +1,5 @@
 """Definitions of the plausible set in tables: their names, and that one table never mixes them."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -18,13 +14,13 @@ from runners.evaluation.metrics import definition_label
 from tests.chsel.plausible.scenes import WORKSPACE, ball
 
 
-def definition(name: str, **changes: Any) -> dict[str, Any]:
+def definition(name, **changes):
     """A choice of the command, with its settings changed."""
     values = {**settings_mapping(plausible_settings(name, 1.0)), "epsilon": None}
     return {"name": name, **values, **changes}
 
 
-def test_every_definition_has_its_own_name_and_changed_ones_have_others() -> None:
+def test_every_definition_has_its_own_name_and_changed_ones_have_others():
     assert [definition_label(definition(name)) for name in DEFINITIONS] == list(DEFINITIONS)
     assert [definition_name(plausible_settings(name, 0.02)) for name in DEFINITIONS] == list(
         DEFINITIONS
@@ -43,7 +39,7 @@ def test_every_definition_has_its_own_name_and_changed_ones_have_others() -> Non
 
 
 @pytest.mark.parametrize(("name", "expected"), [("wide_sums", 0.02), ("wide_means", 0.005)])
-def test_wide_definitions_add_up_contacts_or_take_their_mean(name: str, expected: float) -> None:
+def test_wide_definitions_add_up_contacts_or_take_their_mean(name, expected):
     """A ball that is 5 mm off four contacts on its sides."""
     contacts = 0.1 * np.array(
         [[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]
@@ -59,6 +55,6 @@ def test_wide_definitions_add_up_contacts_or_take_their_mean(name: str, expected
     assert settings.cost.tolerance == 0.0
 
 
-def test_a_definition_that_cannot_be_is_named() -> None:
+def test_a_definition_that_cannot_be_is_named():
     with pytest.raises(SettingError, match=r"definition\.cost: combine is 'medians'"):
         definition_label({"name": "mine", "cost": {"combine": "medians"}})

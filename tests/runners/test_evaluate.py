@@ -25,7 +25,7 @@ from runners.command.choices import CONF
 from runners.evaluation.metrics import definition_label
 from runners.evaluation.plan import Plan, Trial
 from runners.reporting.tables import number
-from tests.runners.in_process import Done, run
+from tests.runners.in_process import run
 from tests.runners.test_plausible import rows
 
 SMALL = (
@@ -51,7 +51,7 @@ TRIAL = Path("trials") / "mustard" / "seed_0"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A finished evaluation of two methods."""
     folder = tmp_path_factory.mktemp("evaluate") / "out"
     done = evaluated(folder, METHODS)
@@ -61,24 +61,22 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def evaluated(folder: Path, *arguments: str) -> Done:
+def evaluated(folder, *arguments):
     """Run the command in this process, with one worker."""
     switches = [word for word in arguments if word.startswith("-")]
     rest = [word for word in arguments if word not in switches]
     return run(evaluate.main, *switches, *SMALL, f"out={folder}", "workers=1", *rest)
 
 
-def table(folder: Path, name: str = "results") -> list[dict[str, object]]:
+def table(folder, name="results"):
     return pa.parquet.read_table(folder / f"{name}.parquet").to_pylist()
 
 
 @pytest.mark.parametrize("path", sorted(CONF.glob("experiment/*.yaml")), ids=lambda path: path.stem)
-def test_every_experiment_can_be_planned(
-    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_experiment_can_be_planned(path, tmp_path, monkeypatch):
     planned: list[tuple[Plan, list[Trial]]] = []
 
-    def instead(plan: Plan, trials: list[Trial], *_: object) -> bool:
+    def instead(plan, trials, *_):
         planned.append((plan, trials))
         return False
 
@@ -95,7 +93,7 @@ def test_every_experiment_can_be_planned(
         assert (settings.cost.tolerance, settings.fill_to) == (0.01, 300)
 
 
-def test_the_table_has_a_row_a_registration_that_the_recordings_confirm(folder: Path) -> None:
+def test_the_table_has_a_row_a_registration_that_the_recordings_confirm(folder):
     results = table(folder)
     assert [(row["method"], row["step"]) for row in results] == [
         ("chsel", 4),
@@ -121,7 +119,7 @@ def test_the_table_has_a_row_a_registration_that_the_recordings_confirm(folder: 
         assert [verdict.outcome for verdict in verdicts] == [EQUAL, EQUAL]
 
 
-def test_metrics_are_those_of_runners_plausible(folder: Path) -> None:
+def test_metrics_are_those_of_runners_plausible(folder):
     small = [word for word in SMALL if word.startswith(("definition", "metrics"))]
     done = run(plausible.main, str(folder / TRIAL / "icp.mcap"), *small)
     assert (done.returncode, done.stderr) == (0, "")
@@ -133,7 +131,7 @@ def test_metrics_are_those_of_runners_plausible(folder: Path) -> None:
             assert number(row[name]) in text
 
 
-def test_registrations_are_those_of_runners_probe(folder: Path, tmp_path: Path) -> None:
+def test_registrations_are_those_of_runners_probe(folder, tmp_path):
     session = ("session=recorded", f"session.path={folder / TRIAL / 'session.mcap'}")
     done = run(probe.main, *session, "method=icp", "recording=mcap", f"logs={tmp_path}")
     assert (done.returncode, done.stderr) == (0, "")
@@ -144,7 +142,7 @@ def test_registrations_are_those_of_runners_probe(folder: Path, tmp_path: Path) 
             assert recording.hypotheses(row["step"]).digest == row["digest"]
 
 
-def test_what_is_finished_is_not_done_again(folder: Path) -> None:
+def test_what_is_finished_is_not_done_again(folder):
     before = stamps(folder)
     again = evaluated(folder, METHODS)
     assert "3 tasks, of which 3 are finished" in again.stdout
@@ -162,7 +160,7 @@ def test_what_is_finished_is_not_done_again(folder: Path) -> None:
     assert told["methods"]["svgd"]["settings"]["iterations"] == 5
 
 
-def stamps(folder: Path) -> dict[str, int]:
+def stamps(folder):
     """When each finished file of the trials was written."""
     files = [path for path in (folder / "trials").rglob("[!.]*") if path.is_file()]
     return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in files}
@@ -187,7 +185,7 @@ def stamps(folder: Path) -> dict[str, int]:
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
-def test_a_mistake_is_one_line_on_stderr(folder: Path, arguments: list[str], message: str) -> None:
+def test_a_mistake_is_one_line_on_stderr(folder, arguments, message):
     before = stamps(folder)
     done = run(evaluate.main, *SMALL, METHODS, f"out={folder}", *arguments)
     assert done.returncode == 2
@@ -197,7 +195,7 @@ def test_a_mistake_is_one_line_on_stderr(folder: Path, arguments: list[str], mes
     assert stamps(folder) == before
 
 
-def test_jobs_of_a_sweep_share_a_folder(tmp_path: Path) -> None:
+def test_jobs_of_a_sweep_share_a_folder(tmp_path):
     done = evaluated(tmp_path, "-m", "methods=icp", "configurations=can,box", "steps='4'")
     assert (done.returncode, done.stderr) == (0, "")
     results = table(tmp_path)
@@ -207,11 +205,11 @@ def test_jobs_of_a_sweep_share_a_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_an_interrupted_run_goes_on_and_a_killed_one_leaves_nobody_at_work(tmp_path: Path) -> None:
+def test_an_interrupted_run_goes_on_and_a_killed_one_leaves_nobody_at_work(tmp_path):
     slow = ("settings.chsel.emitter.iterations=1000000", "methods=chsel", "workers=1")
     command = [sys.executable, "-m", "runners.evaluate", *SMALL, f"out={tmp_path}", *slow]
 
-    def started() -> subprocess.Popen[str]:
+    def started():
         """The command, at work on the method; in a process group of its own, as in a shell."""
         before = set(glob("trials/*/*/.chsel.mcap.*", root_dir=tmp_path))
         process = subprocess.Popen(
@@ -247,5 +245,5 @@ def test_an_interrupted_run_goes_on_and_a_killed_one_leaves_nobody_at_work(tmp_p
     assert stamps(tmp_path) == kept
 
 
-def children(process: int) -> list[psutil.Process]:
+def children(process):
     return psutil.Process(process).children(recursive=True)

@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,7 +17,7 @@ from distributed import Client
 
 from chsel.errors import ChselError, SettingError
 from chsel.methods.icp import Icp
-from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.numerics.arrays import FloatArray
 from chsel.plausible.plausible_set import read_plausible
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.plausible.pose_metrics import pose_errors
@@ -56,7 +54,7 @@ FAST = {"chsel": {"descent": {"restarts": 1}, "emitter": {"iterations": 20}}}
 FAST["chsel_cma_me"] = FAST["chsel"]
 
 
-def plan_in(folder: Path, methods: Any = ("icp",), **changes: Any) -> Plan:
+def plan_in(folder, methods=("icp",), **changes):
     """A plan of two steps of a kinematic session, with a small grid of plausible poses."""
     definition = settings_mapping(plausible_settings("default", 1.0))
     definition["grid"] |= {"rotations": 300, "upright": 4}
@@ -79,7 +77,7 @@ def plan_in(folder: Path, methods: Any = ("icp",), **changes: Any) -> Plan:
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def session(tmp_path_factory):
     """A trial's folder with its session and plausible sets."""
     plan = plan_in(tmp_path_factory.mktemp("session"))
     assert do_task(plan, Task(TRIAL)) == ""
@@ -90,10 +88,10 @@ MakePlan = Callable[..., Plan]
 
 
 @pytest.fixture
-def make_plan(session: Path, tmp_path: Path) -> MakePlan:
+def make_plan(session, tmp_path):
     """Makes a plan in a folder of its own, whose session is there already."""
 
-    def make(methods: Any = ("icp",), **changes: Any) -> Plan:
+    def make(methods=("icp",), **changes):
         plan = plan_in(tmp_path / "out", methods, **changes)
         join_experiment(plan, "test", [TRIAL.configuration], [TRIAL.seed])
         there = TRIAL.folder(plan)
@@ -105,11 +103,11 @@ def make_plan(session: Path, tmp_path: Path) -> MakePlan:
     return make
 
 
-def results(plan: Plan) -> list[dict[str, Any]]:
+def results(plan):
     return collect(plan.folder).to_pylist()
 
 
-def test_configurations_and_seeds_are_named_alone_by_patterns_by_object_or_in_lists() -> None:
+def test_configurations_and_seeds_are_named_alone_by_patterns_by_object_or_in_lists():
     found = configurations_of("kinematic")
     existing = {name: one.object for name, one in found.items() if one.faults == "clean"}
     for value, names in {
@@ -126,7 +124,7 @@ def test_configurations_and_seeds_are_named_alone_by_patterns_by_object_or_in_li
     assert chosen_seeds("7,0..1") == (0, 1, 7)
 
 
-def test_a_contender_has_its_preset_and_changes_by_method_label_and_entry() -> None:
+def test_a_contender_has_its_preset_and_changes_by_method_label_and_entry():
     entries = [
         "chsel",
         "chsel@paper#bins",
@@ -148,19 +146,19 @@ Cluster = tuple[Client, int]
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
+def cluster():
     """A cluster of one worker."""
     with connected(None, 1) as cluster:
         yield cluster
 
 
-def finished(plan: Plan, cluster: Cluster) -> dict[str, str]:
+def finished(plan, cluster):
     """Do all tasks of the trial that are not done; why each failed, by its label."""
     missing = [task for task in tasks_of(plan, [TRIAL]) if not is_finished(plan, task)]
     return {task.label: failure for task, failure in do_tasks(plan, missing, *cluster)}
 
 
-def _dies(plan: Plan, task: Task) -> None:
+def _dies(plan, task):
     """Kills its worker, always or once, by the label of the task."""
     mark = plan.folder / "tried"
     if task.label == "always" or (task.label == "once" and not mark.exists()):
@@ -170,8 +168,8 @@ def _dies(plan: Plan, task: Task) -> None:
 
 
 def test_a_worker_that_dies_once_costs_nothing_and_twice_its_task_alone(
-    make_plan: MakePlan, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    make_plan, cluster, monkeypatch
+):
     monkeypatch.setattr(tasks, "do_task", _dies)
     plan = make_plan([{"name": "icp", "label": label} for label in ("always", "once", "fine")])
     ended = finished(plan, cluster)
@@ -189,22 +187,20 @@ def test_a_worker_that_dies_once_costs_nothing_and_twice_its_task_alone(
     assert not list(TRIAL.folder(plan).glob("*failed*"))
 
 
-def test_workers_of_several_threads_are_refused() -> None:
+def test_workers_of_several_threads_are_refused():
     client = SimpleNamespace(nthreads=lambda: {"tcp://a": 1, "tcp://b": 4})
     with pytest.raises(SettingError, match="a worker has 4 threads; accepted: one"):
-        checked_size(client)  # type: ignore[arg-type]
+        checked_size(client)
 
 
 class _FailsAtFour(Icp):
-    def register(self, problem: Any, observer: Any = None) -> Hypotheses:
+    def register(self, problem, observer=None):
         if problem.key.step == 4:
             raise ChselError("nothing\nto see")
         return super().register(problem, observer)
 
 
-def test_a_registration_that_fails_is_a_row_and_the_session_goes_on(
-    make_plan: MakePlan, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_registration_that_fails_is_a_row_and_the_session_goes_on(make_plan, monkeypatch):
     plan = make_plan()
     monkeypatch.setattr(Contender, "method", lambda self: _FailsAtFour())
     assert do_task(plan, Task(TRIAL, "icp")) == ""
@@ -217,9 +213,7 @@ def test_a_registration_that_fails_is_a_row_and_the_session_goes_on(
     assert [verdict.outcome for verdict in verdicts] == [NO_RESULT, EQUAL]
 
 
-def test_a_session_that_fails_fails_its_methods_and_no_others(
-    tmp_path: Path, cluster: Cluster
-) -> None:
+def test_a_session_that_fails_fails_its_methods_and_no_others(tmp_path, cluster):
     plan = plan_in(tmp_path, objects="scans", assets=tmp_path / "nowhere")
     join_experiment(plan, "test", [TRIAL.configuration], [TRIAL.seed])
     ended = finished(plan, cluster)
@@ -229,7 +223,7 @@ def test_a_session_that_fails_fails_its_methods_and_no_others(
     assert row["status"].startswith("failed: session: ")
 
 
-def test_sets_from_outside_rank_as_methods_do(make_plan: MakePlan, tmp_path: Path) -> None:
+def test_sets_from_outside_rank_as_methods_do(make_plan, tmp_path):
     folders = {name: tmp_path / name for name in ("perfect", "text", "absent")}
     for folder in folders.values():
         (folder / "mustard").mkdir(parents=True)
@@ -267,7 +261,7 @@ def test_sets_from_outside_rank_as_methods_do(make_plan: MakePlan, tmp_path: Pat
     assert not is_finished(plan, task)
 
 
-def step_of(plan: Plan, points_digest: str) -> int:
+def step_of(plan, points_digest):
     """The step whose known points have a digest."""
     found = problems(plan, TRIAL, open_recorded(plan, TRIAL))
     return next(one.key.step for one in found if one.points.digest == points_digest)
@@ -277,7 +271,7 @@ POSE = np.eye(4)
 SCALED = np.diag([1.1, 1.0, 1.0, 1.0])
 
 
-def test_a_set_from_outside_that_is_wrong_is_told(tmp_path: Path) -> None:
+def test_a_set_from_outside_that_is_wrong_is_told(tmp_path):
     (tmp_path / "mustard").mkdir()
     plan = plan_in(tmp_path, outside={"mine": tmp_path})
     for values, message in (
@@ -293,7 +287,7 @@ def test_a_set_from_outside_that_is_wrong_is_told(tmp_path: Path) -> None:
             read_external(plan, TRIAL, "mine")
 
 
-def test_searches_are_measured_from_the_same_starts(make_plan: MakePlan) -> None:
+def test_searches_are_measured_from_the_same_starts(make_plan):
     plan = make_plan(["chsel", "chsel_cma_me"], starts="gradient_descent", every=5)
     for label in plan.contenders:
         assert do_task(plan, Task(TRIAL, label)) == ""
@@ -317,13 +311,13 @@ def test_searches_are_measured_from_the_same_starts(make_plan: MakePlan) -> None
 
 
 def test_a_session_with_faults_is_measured_by_the_plausible_sets_of_that_without(
-    make_plan: MakePlan, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    make_plan, monkeypatch
+):
     plan, faulty = make_plan(steps="5"), Trial(0, "mustard+noise_3mm")
     join_experiment(plan, "test", [faulty.configuration], [0])
     asked: list[FloatArray] = []
 
-    def holds(self: Icp, problem: Any, found: Any, poses: FloatArray) -> BoolArray:
+    def holds(self, problem, found, poses):
         asked.append(poses)
         return np.array([problem.key.step == 5])
 

@@ -1,20 +1,16 @@
 """One run at a time writes into the folder of an evaluation."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 from filelock import FileLock, Timeout
 
 from runners.evaluation.experiment import writing_alone
 
 
-def test_a_second_run_in_a_folder_waits_for_the_first(tmp_path: Path) -> None:
+def test_a_second_run_in_a_folder_waits_for_the_first(tmp_path):
     lock, said = FileLock(tmp_path / ".lock"), list[str]()
     lock.acquire()
 
-    def end_the_first(line: str) -> None:
+    def end_the_first(line):
         said.append(line)
         lock.release()
 

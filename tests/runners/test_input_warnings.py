@@ -1,15 +1,11 @@
 """Input that is hardly meant: said on the terminal, in the log, and in the summary."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
 
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from replay.events import Logged
@@ -32,7 +28,7 @@ QUICK = (
 Found = tuple[Done, list[dict[str, Any]], list[tuple[int, str]]]
 
 
-def probe(folder: Path, *overrides: str, points: dict[str, Any], mesh: Any = BOX) -> Found:
+def probe(folder, *overrides, points, mesh=BOX):
     """A session of points: the command, its summary's warnings, and those of its recording."""
     np.savez(folder / "points.npz", **points)
     mesh.export(folder / "box.ply")
@@ -50,17 +46,17 @@ def probe(folder: Path, *overrides: str, points: dict[str, Any], mesh: Any = BOX
     return done, told, [(event.step, event.text) for event in logged]
 
 
-def said(done: Done) -> list[str]:
+def said(done):
     """The warnings on the terminal."""
     lines = (done.stdout + done.stderr).splitlines()
     return [line.removeprefix("warning: ") for line in lines if line.startswith("warning: ")]
 
 
-def sequence(surface: FloatArray = SURFACE, free: FloatArray = FREE) -> dict[str, Any]:
+def sequence(surface=SURFACE, free=FREE):
     return {"surface": surface, "surface_step": STEPS, "free": free}
 
 
-def test_a_warning_is_given_once_with_the_step_at_which_it_first_holds(tmp_path: Path) -> None:
+def test_a_warning_is_given_once_with_the_step_at_which_it_first_holds(tmp_path):
     surface = SURFACE.copy()
     surface[[15, 25]] = [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]  # of the second and third probe
     done, told, logged = probe(tmp_path, points=sequence(surface))
@@ -76,7 +72,7 @@ def test_a_warning_is_given_once_with_the_step_at_which_it_first_holds(tmp_path:
     assert words == ["probe", "probe", "warning:", "warning:", "probe"]
 
 
-def test_free_points_alone_are_a_warning_at_the_end(tmp_path: Path) -> None:
+def test_free_points_alone_are_a_warning_at_the_end(tmp_path):
     steps = np.arange(len(FREE)) % 3
     done, told, logged = probe(tmp_path, points={"free": FREE, "free_step": steps})
     assert [(each["step"], each["code"]) for each in told] == [(2, "no_contact")]
@@ -84,9 +80,7 @@ def test_free_points_alone_are_a_warning_at_the_end(tmp_path: Path) -> None:
     assert logged == [(2, told[0]["text"])]
 
 
-def test_points_outside_of_a_given_workspace_are_a_warning_even_unregistered(
-    tmp_path: Path,
-) -> None:
+def test_points_outside_of_a_given_workspace_are_a_warning_even_unregistered(tmp_path):
     workspace = "session.workspace=[[0.13,0.5],[0,0.5],[0,0.5]]"
     never = "session.start_contacts=100"
     done, told, _ = probe(tmp_path, workspace, never, points=sequence())
@@ -94,7 +88,7 @@ def test_points_outside_of_a_given_workspace_are_a_warning_even_unregistered(
     assert "outside of the workspace [[0.13, 0.5], [0, 0.5], [0, 0.5]]" in said(done)[0]
 
 
-def test_points_in_millimetres_are_an_error_before_anything_is_written(tmp_path: Path) -> None:
+def test_points_in_millimetres_are_an_error_before_anything_is_written(tmp_path):
     done, _, _ = probe(tmp_path, points=sequence(1000.0 * SURFACE, 1000.0 * FREE))
     assert done.returncode == 2
     assert done.stderr.startswith(f"error: point file {tmp_path / 'points.npz'}: points on the obj")
@@ -103,7 +97,7 @@ def test_points_in_millimetres_are_an_error_before_anything_is_written(tmp_path:
     assert not (tmp_path / "logs").exists()
 
 
-def test_warnings_about_the_object_come_first_and_are_recorded_too(tmp_path: Path) -> None:
+def test_warnings_about_the_object_come_first_and_are_recorded_too(tmp_path):
     two = trimesh.util.concatenate([BOX, BOX.copy().apply_translation((0.0, 1.0, 0.0))])
     points = sequence(SURFACE, FREE[:0])
     done, told, logged = probe(tmp_path, "object.scale=1.5", points=points, mesh=two)
@@ -115,7 +109,7 @@ def test_warnings_about_the_object_come_first_and_are_recorded_too(tmp_path: Pat
     assert done.stdout.index("warning: ") < done.stdout.index("probe   0")
 
 
-def test_a_recording_of_such_points_gives_the_warnings_again(tmp_path: Path) -> None:
+def test_a_recording_of_such_points_gives_the_warnings_again(tmp_path):
     surface = SURFACE.copy()
     surface[15] = [5.0, 0.0, 0.0]
     _, told, _ = probe(tmp_path, points=sequence(surface))
@@ -129,7 +123,7 @@ def test_a_recording_of_such_points_gives_the_warnings_again(tmp_path: Path) -> 
     assert said(done) == [each["text"] for each in told]
 
 
-def test_a_simulated_session_gives_no_warning(tmp_path: Path) -> None:
+def test_a_simulated_session_gives_no_warning(tmp_path):
     """Its object is larger than life on purpose."""
     chosen = ["session=kinematic", "object=spam_can", "session.start_probe=11"]
     done = run(main, *chosen, "recording=mcap", f"logs={tmp_path}")

@@ -1,13 +1,10 @@
 """Sweeps of runners.probe through Hydra's launchers, as far as one machine can."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import yaml
@@ -20,7 +17,7 @@ PLUGINS = {"joblib": "hydra_joblib_launcher", "submitit_local": "hydra_submitit_
 SMALL = ("object=mustard", "session=kinematic", "method=icp", "recording=mcap")
 
 
-def needs(launcher: str) -> None:
+def needs(launcher):
     plugin = PLUGINS[launcher]
     try:
         found = importlib.util.find_spec(f"hydra_plugins.{plugin}")
@@ -31,7 +28,7 @@ def needs(launcher: str) -> None:
         pytest.skip(f"needs {plugin}: pip install -e '.[sweep-{extra}]', see docs/sweeps.md")
 
 
-def sweep(launcher: str, folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
+def sweep(launcher, folder, *overrides):
     """Run a sweep over seeds 0 and 1."""
     command = [sys.executable, "-m", "runners.probe", "-m", f"hydra/launcher={launcher}"]
     command += ["seed=0,1", *SMALL, f"logs={folder / 'logs'}", *overrides]
@@ -40,7 +37,7 @@ def sweep(launcher: str, folder: Path, *overrides: str) -> subprocess.CompletedP
 
 
 @pytest.mark.parametrize("launcher", PLUGINS)
-def test_every_job_of_a_sweep_records_its_session(launcher: str, tmp_path: Path) -> None:
+def test_every_job_of_a_sweep_records_its_session(launcher, tmp_path):
     needs(launcher)
     done = sweep(launcher, tmp_path)
     assert done.returncode == 0, done.stderr
@@ -55,7 +52,7 @@ def test_every_job_of_a_sweep_records_its_session(launcher: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize("launcher", PLUGINS)
-def test_a_mistake_in_a_job_is_an_error_of_the_sweep(launcher: str, tmp_path: Path) -> None:
+def test_a_mistake_in_a_job_is_an_error_of_the_sweep(launcher, tmp_path):
     needs(launcher)
     done = sweep(launcher, tmp_path, "method.iterations=-1")
     assert done.returncode == 2, done.stderr

@@ -1,9 +1,5 @@
 """The choice of an object leads to its mesh, or to a clear error."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 import trimesh
 from hydra import compose, initialize_config_dir
@@ -28,14 +24,14 @@ TRIALS = {
 }
 
 
-def chosen(*overrides: str) -> ObjectConfig:
+def chosen(*overrides):
     """The object that a command line with these overrides chooses."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = plain(compose("fetch", overrides=list(overrides)))
     return build_settings(ObjectConfig, config["object"], "object")
 
 
-def test_models_and_scans_share_the_scales_of_the_trials() -> None:
+def test_models_and_scans_share_the_scales_of_the_trials():
     for name, trial in TRIALS.items():
         for choice, kind in ((name, "model"), (f"ycb/{name}", "scan")):
             config = chosen(f"object={choice}")
@@ -43,16 +39,14 @@ def test_models_and_scans_share_the_scales_of_the_trials() -> None:
             assert (config.scale, config.epsilon, config.configuration) == trial
 
 
-def test_a_scan_is_loaded_closed_and_at_its_scale(ycb_directory: Path) -> None:
+def test_a_scan_is_loaded_closed_and_at_its_scale(ycb_directory):
     loaded = load_object(chosen("object=ycb/cracker_box"), ycb_directory)
     assert loaded.mesh.extents == pytest.approx([0.135, 0.2517, 0.3576], rel=0.002)
     assert loaded.mesh.is_watertight
     assert (loaded.name, loaded.scale, loaded.epsilon) == ("cracker_box", 1.5, 0.0005)
 
 
-def test_a_mesh_file_is_found_from_the_working_directory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mesh_file_is_found_from_the_working_directory(tmp_path, monkeypatch):
     trimesh.creation.box((100, 200, 300)).export(tmp_path / "thing.stl")
     monkeypatch.chdir(tmp_path)
     config = chosen("object=mesh", "object.path=thing.stl", "object.scale=0.001")
@@ -72,7 +66,7 @@ def test_a_mesh_file_is_found_from_the_working_directory(
         ("object=ycb/drill object.scan=../x", r"object\.scan is .*accepted: a name such as"),
     ],
 )
-def test_a_choice_that_cannot_be_is_named(overrides: str, message: str, tmp_path: Path) -> None:
+def test_a_choice_that_cannot_be_is_named(overrides, message, tmp_path):
     with pytest.raises(SettingError, match=message):
         load_object(chosen(*overrides.split()), tmp_path)
 
@@ -89,7 +83,7 @@ def test_a_choice_that_cannot_be_is_named(overrides: str, message: str, tmp_path
         ("object=mesh object.path=other.stl", r"other\.stl does not exist"),
     ],
 )
-def test_a_missing_file_tells_what_to_do(overrides: str, message: str, tmp_path: Path) -> None:
+def test_a_missing_file_tells_what_to_do(overrides, message, tmp_path):
     with pytest.raises(MeshError, match=message):
         load_object(chosen(*overrides.split()), tmp_path)
 
@@ -98,9 +92,7 @@ def test_a_missing_file_tells_what_to_do(overrides: str, message: str, tmp_path:
     ("length", "scale", "count"),
     [(0.04, 1.0, 0), (0.04, 0.001, 0), (0.49, 1.0, 0), (0.04, 2.5, 1), (0.51, 1.0, 1)],
 )
-def test_enlarged_objects_and_those_longer_than_the_workspace_are_a_warning(
-    length: float, scale: float, count: int
-) -> None:
+def test_enlarged_objects_and_those_longer_than_the_workspace_are_a_warning(length, scale, count):
     model = ObjectModel("box", trimesh.creation.box((length, 0.02, 0.03)), scale, 0.001, "drill")
     found = check_size(model, Workspace((0.0, 0.0, 0.0), (0.4, 0.5, 0.3)))
     text = (
@@ -110,9 +102,7 @@ def test_enlarged_objects_and_those_longer_than_the_workspace_are_a_warning(
     assert [(one.code, one.text) for one in found] == [("object_size", text)] * count
 
 
-def test_the_command_downloads_nothing_that_is_there_or_needs_no_download(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_downloads_nothing_that_is_there_or_needs_no_download(tmp_path, monkeypatch):
     monkeypatch.setenv("CHSEL_ASSETS", str(tmp_path))
     (tmp_path / "050_medium_clamp" / "google_16k").mkdir(parents=True)
     done = run(fetch.main, "object=ycb/clamp")

@@ -1,11 +1,8 @@
 """The command that makes plausible sets, as a user runs it."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,7 +26,7 @@ SMALL = (
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A box, points on it in two files, of which one says where it is, and a recording."""
     folder = tmp_path_factory.mktemp("plausible")
     box = trimesh.creation.box((0.1, 0.06, 0.2))
@@ -56,13 +53,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def rows(output: str) -> list[list[str]]:
+def rows(output):
     """The cells of the table's rows, as text."""
     lines = [line.split() for line in output.splitlines()]
     return [line for line in lines if line and line[0].isdigit()]
 
 
-def test_a_recording_gets_its_sets_and_its_hypotheses_are_measured(folder: Path) -> None:
+def test_a_recording_gets_its_sets_and_its_hypotheses_are_measured(folder):
     path = folder / "recording.mcap"
     command = [sys.executable, "-m", "runners.plausible", str(path), *SMALL]
     environment = {**os.environ, "COLUMNS": "160"}
@@ -96,7 +93,7 @@ def test_a_recording_gets_its_sets_and_its_hypotheses_are_measured(folder: Path)
     assert "belongs to other points" in refused.stdout
 
 
-def test_a_points_file_needs_its_object_and_the_true_pose_in_it_or_beside_it(folder: Path) -> None:
+def test_a_points_file_needs_its_object_and_the_true_pose_in_it_or_beside_it(folder):
     thing = ("object=mesh", f"object.path={folder / 'box.ply'}", f"out={folder / 'sets'}", *SMALL)
     done = run(plausible.main, str(folder / "box.npz"), "1", *thing, "definition=paper")
     assert (done.returncode, done.stderr) == (0, "")
@@ -128,7 +125,7 @@ def test_a_points_file_needs_its_object_and_the_true_pose_in_it_or_beside_it(fol
         (["{recording}", "metrics.quantile=2"], "quantile is 2.0"),
     ],
 )
-def test_a_mistake_is_one_line_on_stderr(folder: Path, arguments: list[str], message: str) -> None:
+def test_a_mistake_is_one_line_on_stderr(folder, arguments, message):
     given = [word.format(recording=folder / "recording.mcap") for word in arguments]
     done = run(plausible.main, *given)
     assert done.returncode == 2

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 import chsel
 from chsel.errors import MeshError
-from chsel.numerics.arrays import FloatArray
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import object_symmetry
 from replay.events import Logged, Measured
@@ -26,7 +25,6 @@ from replay.mcap.reader import read_recording
 from runners import probe
 from runners.command.choices import CONF
 from runners.run.display import MEANINGS
-from tests.runners.in_process import Done
 from tests.runners.in_process import run as in_process
 from tests.tools.kill_sessions import points_session
 
@@ -40,31 +38,29 @@ QUICK = (
 
 
 @pytest.fixture(scope="module")
-def points(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
+def points(tmp_path_factory):
     """A session of three steps on a box: the overrides that select it."""
     return points_session(tmp_path_factory.mktemp("points"), probes=3)
 
 
-def run(folder: Path, *overrides: str) -> Done:
+def run(folder, *overrides):
     return in_process(probe.main, *overrides, f"logs={folder}", columns=120)
 
 
-def run_folder(logs: Path) -> Path:
+def run_folder(logs):
     (folder,) = (logs / "probe").iterdir()
     return folder
 
 
 @pytest.fixture(scope="module")
-def finished(
-    points: tuple[str, ...], tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, Done]:
+def finished(points, tmp_path_factory):
     logs = tmp_path_factory.mktemp("logs")
     done = run(logs, *points, *QUICK)
     assert done.returncode == 0, done.stderr
     return run_folder(logs), done
 
 
-def test_recorded_errors_are_modulo_symmetries(finished: tuple[Path, Done]) -> None:
+def test_recorded_errors_are_modulo_symmetries(finished):
     recording = read_recording(finished[0] / "recording.mcap")
     symmetry = object_symmetry(recording.start.mesh)
     assert len(symmetry.rotations) == 4
@@ -77,9 +73,7 @@ def test_recorded_errors_are_modulo_symmetries(finished: tuple[Path, Done]) -> N
         assert event.values == pytest.approx(expected, abs=1e-6)
 
 
-def test_trust_is_on_the_terminal_in_the_summary_and_in_the_log(
-    finished: tuple[Path, Done],
-) -> None:
+def test_trust_is_on_the_terminal_in_the_summary_and_in_the_log(finished):
     folder, done = finished
     recording = read_recording(folder / "recording.mcap")
     trusts = [chsel.trust_in(recording.problem(n), recording.hypotheses(n)) for n in range(3)]
@@ -94,7 +88,7 @@ def test_trust_is_on_the_terminal_in_the_summary_and_in_the_log(
     assert shown.rpartition(f"{trusts[2]}: ")[2] in set(MEANINGS.values())
 
 
-def shown_pose(done: Done, step: int) -> FloatArray:
+def shown_pose(done, step):
     """The pose at the end of a run, world_from_object (4, 4), from millimetres and x y z w."""
     _, _, shown = done.stdout.partition(f"best pose after probe {step}, world_from_object")
     _, position, quaternion = shown.splitlines()[:3]
@@ -106,9 +100,7 @@ def shown_pose(done: Done, step: int) -> FloatArray:
     return pose
 
 
-def test_a_run_ends_with_the_best_pose_and_its_summary_has_one_a_mode(
-    finished: tuple[Path, Done],
-) -> None:
+def test_a_run_ends_with_the_best_pose_and_its_summary_has_one_a_mode(finished):
     folder, done = finished
     recording = read_recording(folder / "recording.mcap")
     rows = json.loads((folder / "summary.json").read_text())["steps"]
@@ -124,8 +116,8 @@ def test_a_run_ends_with_the_best_pose_and_its_summary_has_one_a_mode(
 
 
 def test_points_of_ones_own_are_registered_by_anchored_unless_a_method_is_named(
-    points: tuple[str, ...], finished: tuple[Path, Done], tmp_path: Path
-) -> None:
+    points, finished, tmp_path
+):
     done = run(tmp_path, *points, "method.size=small", "recording=none")
     assert done.returncode == 0, done.stderr
     line = "method=anchored (the default for session=points; method=chsel is the paper's)"
@@ -147,14 +139,12 @@ def test_points_of_ones_own_are_registered_by_anchored_unless_a_method_is_named(
         (("session=points", "method=icp"), "icp"),
     ],
 )
-def test_the_default_method_follows_from_session_policy_and_preset(
-    overrides: tuple[str, ...], method: str
-) -> None:
+def test_the_default_method_follows_from_session_policy_and_preset(overrides, method):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         assert compose("probe", [*overrides]).method.name == method
 
 
-def test_a_run_leaves_recordings_config_and_summary(finished: tuple[Path, Done]) -> None:
+def test_a_run_leaves_recordings_config_and_summary(finished):
     folder, done = finished
     names = {file.name for file in folder.iterdir()}
     assert names == {"recording.mcap", "recording.rrd", "config.yaml", "summary.json"}
@@ -175,18 +165,14 @@ def test_a_run_leaves_recordings_config_and_summary(finished: tuple[Path, Done])
     assert done.stderr == ""
 
 
-def test_the_same_command_writes_the_same_bytes_and_no_path_or_clock(
-    points: tuple[str, ...], finished: tuple[Path, Done], tmp_path: Path
-) -> None:
+def test_the_same_command_writes_the_same_bytes_and_no_path_or_clock(points, finished, tmp_path):
     command = [sys.executable, "-m", "runners.probe", *points, *QUICK, "logs=elsewhere"]
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
     again = (run_folder(tmp_path / "elsewhere") / "recording.mcap").read_bytes()
     assert again == (finished[0] / "recording.mcap").read_bytes()
 
 
-def test_recording_snapshots_and_threads_change_no_result(
-    points: tuple[str, ...], finished: tuple[Path, Done], tmp_path: Path
-) -> None:
+def test_recording_snapshots_and_threads_change_no_result(points, finished, tmp_path):
     done = run(
         tmp_path, *points, *QUICK, "recording=none", "recording.snapshot_interval=0", "threads=2"
     )
@@ -201,9 +187,7 @@ def test_recording_snapshots_and_threads_change_no_result(
     assert digests[0] == digests[1]
 
 
-def test_a_recorded_session_repeats_the_probes_with_another_method(
-    finished: tuple[Path, Done], tmp_path: Path
-) -> None:
+def test_a_recorded_session_repeats_the_probes_with_another_method(finished, tmp_path):
     source = finished[0] / "recording.mcap"
     chosen = ("session=recorded", f"session.path={source}", "method=gradient_descent", *QUICK[:2])
     done = run(tmp_path, *chosen, "recording=mcap")
@@ -216,9 +200,7 @@ def test_a_recorded_session_repeats_the_probes_with_another_method(
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_ctrl_c_ends_with_a_whole_recording_and_status_130(
-    points: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_ctrl_c_ends_with_a_whole_recording_and_status_130(points, tmp_path):
     command = [sys.executable, "-m", "runners.probe", *points, f"logs={tmp_path}"]
     slow = ["method=chsel", "method.emitter.iterations=50000", "recording=mcap"]
     process = subprocess.Popen(command + slow, stdout=subprocess.PIPE, text=True)
@@ -266,9 +248,7 @@ def test_ctrl_c_ends_with_a_whole_recording_and_status_130(
         ),
     ],
 )
-def test_a_mistake_is_one_line_and_status_2(
-    points: tuple[str, ...], tmp_path: Path, override: str, message: str
-) -> None:
+def test_a_mistake_is_one_line_and_status_2(points, tmp_path, override, message):
     chosen = () if override.startswith("session=") else points
     logs = () if override.startswith("logs=") else (f"logs={tmp_path}",)
     done = in_process(probe.main, *logs, *chosen, *override.split())
@@ -279,6 +259,6 @@ def test_a_mistake_is_one_line_and_status_2(
     assert not list(tmp_path.rglob("*"))
 
 
-def test_traceback_is_shown_when_asked_for(points: tuple[str, ...], tmp_path: Path) -> None:
+def test_traceback_is_shown_when_asked_for(points, tmp_path):
     with pytest.raises(MeshError):  # which Python prints with its traceback
         run(tmp_path, *points, "object.path=nothing.obj", "--traceback")

@@ -5,21 +5,18 @@ from __future__ import annotations
 import enum
 import json
 from collections.abc import Sequence
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.mcap.reader import read_recording
 from runners import evaluate, published
 from runners.published_package.process import RefusedError
 from runners.published_package.worker import Worker
-from tests.runners.in_process import Done, run
+from tests.runners.in_process import run
 from tests.runners.test_evaluate import SMALL, table
 
 VERSIONS = {"chsel": "0.2.1", "torch": "2"}
@@ -28,23 +25,23 @@ VERSIONS = {"chsel": "0.2.1", "torch": "2"}
 class StandIn:
     """In the place of the package's process: moves the starts by 1 cm, the last the cheapest."""
 
-    def __init__(self, versions: dict[str, str] = VERSIONS) -> None:
+    def __init__(self, versions=VERSIONS):
         self.versions = versions
         self.problems: list[RegistrationProblem] = []
         self.seeds: list[int] = []
         self.refused: Sequence[int] = ()
 
-    def __enter__(self) -> StandIn:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         return None
 
-    def load(self, problem: RegistrationProblem, object_bounds: FloatArray) -> None:
+    def load(self, problem, object_bounds):
         assert object_bounds.shape == (2, 3)
         self.problems.append(problem)
 
-    def register(self, seed: int) -> dict[str, Any]:
+    def register(self, seed):
         self.seeds.append(seed)
         if len(self.problems) in self.refused:
             raise RefusedError("RuntimeError: no  interior\npoints")
@@ -57,7 +54,7 @@ class StandIn:
 
 
 @pytest.fixture
-def stand_in(monkeypatch: pytest.MonkeyPatch) -> StandIn:
+def stand_in(monkeypatch):
     """What the command takes for the package."""
     package = StandIn()
     monkeypatch.setattr(published, "PublishedPackage", lambda python: package)
@@ -65,7 +62,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> StandIn:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """An evaluation of one trial, of one method twice."""
     folder = tmp_path_factory.mktemp("evaluation") / "out"
     done = evaluated(folder)
@@ -73,20 +70,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def evaluated(folder: Path, *more: str) -> Done:
+def evaluated(folder, *more):
     """Run the evaluation, or go on with it."""
     arguments = (f"out={folder}", "workers=1", "methods=[icp]", "draws=2", *more)
     return run(evaluate.main, *SMALL, *arguments)
 
 
-def register(folder: Path, out: Path, *more: str) -> Done:
+def register(folder, out, *more):
     """Run the command."""
     return run(published.main, f"dir={folder}", f"out={out}", "package.python=python", *more)
 
 
-def test_each_step_starts_around_the_best_pose_of_the_one_before(
-    folder: Path, tmp_path: Path, stand_in: StandIn
-) -> None:
+def test_each_step_starts_around_the_best_pose_of_the_one_before(folder, tmp_path, stand_in):
     done = register(folder, tmp_path / "sets")
     assert (done.returncode, done.stderr) == (0, "")
     first, second = stand_in.problems
@@ -115,8 +110,8 @@ def test_each_step_starts_around_the_best_pose_of_the_one_before(
 
 
 def test_draws_differ_in_their_numbers_alone_and_rank_under_labels_of_their_own(
-    folder: Path, tmp_path: Path, stand_in: StandIn
-) -> None:
+    folder, tmp_path, stand_in
+):
     sets = tmp_path / "sets"
     assert register(folder, sets, "draws=2").returncode == 0
     one, _, other, _ = stand_in.problems
@@ -142,8 +137,8 @@ def test_draws_differ_in_their_numbers_alone_and_rank_under_labels_of_their_own(
 
 
 def test_what_is_finished_is_not_registered_again_unless_its_session_or_package_is_another(
-    folder: Path, tmp_path: Path, stand_in: StandIn, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    folder, tmp_path, stand_in, monkeypatch
+):
     assert "of which 0 are finished" in register(folder, tmp_path).stdout
     asked = len(stand_in.seeds)
     assert "of which 1 are finished" in register(folder, tmp_path).stdout
@@ -158,8 +153,8 @@ def test_what_is_finished_is_not_registered_again_unless_its_session_or_package_
 
 
 def test_a_step_that_the_package_refuses_is_told_and_the_session_goes_on(
-    folder: Path, tmp_path: Path, stand_in: StandIn
-) -> None:
+    folder, tmp_path, stand_in
+):
     stand_in.refused = (1,)
     done = register(folder, tmp_path)
     assert done.returncode == 1
@@ -180,14 +175,14 @@ def test_a_step_that_the_package_refuses_is_told_and_the_session_goes_on(
         (["dir=FOLDER", "package.python=/nowhere"], "package.python /nowhere does not run"),
     ],
 )
-def test_a_mistake_is_one_line(folder: Path, arguments: list[str], message: str) -> None:
+def test_a_mistake_is_one_line(folder, arguments, message):
     done = run(published.main, *(argument.replace("FOLDER", str(folder)) for argument in arguments))
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert done.stderr.startswith("error: ")
     assert message in done.stderr
 
 
-def test_the_worker_hands_over_all_points_with_their_kinds(tmp_path: Path) -> None:
+def test_the_worker_hands_over_all_points_with_their_kinds(tmp_path):
     worker = Worker.__new__(Worker)
     kinds = enum.IntEnum("kinds", {"SURFACE": 0, "FREE": 1, "OCCUPIED": 2})
     worker._chsel = SimpleNamespace(SemanticsClass=kinds)

@@ -1,9 +1,6 @@
 """The command that registers real measurements: on made-up ones, and on some of the real ones."""
 
-from __future__ import annotations
-
 import csv
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,14 +8,14 @@ import trimesh
 
 from chsel.problem.poses import apply, axis_angle, compose
 from runners import real
-from tests.runners.in_process import Done, run
+from tests.runners.in_process import run
 
 NOISE = 0.0005  # m
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), 0.4), np.array([0.5, 0.1, 0.2]))
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(tmp_path_factory):
     """Touches of two boxes, those of `known` with the true pose."""
     folder = tmp_path_factory.mktemp("data") / "real"
     folder.mkdir()
@@ -32,19 +29,17 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder.parent
 
 
-def measured(data: Path, out: Path, *arguments: str, case: str = "known") -> Done:
+def measured(data, out, *arguments, case="known"):
     made = [f"+cases.{case}.path={case}.npz", f"+cases.{case}.mesh=box.obj", f"only={case}"]
     return run(real.main, f"data={data}", f"out={out}", "methods=icp", *made, *arguments)
 
 
-def rows(out: Path) -> list[dict[str, str]]:
+def rows(out):
     with (out / "results.csv").open(newline="") as file:
         return list(csv.DictReader(file))
 
 
-def test_rows_have_errors_to_the_pose_and_residuals_of_the_held_out_half(
-    data: Path, tmp_path: Path
-) -> None:
+def test_rows_have_errors_to_the_pose_and_residuals_of_the_held_out_half(data, tmp_path):
     done = measured(data, tmp_path, "seeds=0..1")
     assert (done.returncode, done.stderr) == (0, "")
     *found, published = rows(tmp_path)
@@ -73,7 +68,7 @@ def test_rows_have_errors_to_the_pose_and_residuals_of_the_held_out_half(
     assert digests[:-1] == [row["digest"] for row in found]
 
 
-def test_a_case_without_a_true_pose_has_residuals_alone(data: Path, tmp_path: Path) -> None:
+def test_a_case_without_a_true_pose_has_residuals_alone(data, tmp_path):
     done = measured(data, tmp_path, "seeds=0", "halves=false", case="unknown")
     assert (done.returncode, done.stderr) == (0, "")
     (row,) = rows(tmp_path)
@@ -91,22 +86,20 @@ def test_a_case_without_a_true_pose_has_residuals_alone(data: Path, tmp_path: Pa
         (["methods=magic"], "magic"),
     ],
 )
-def test_mistakes_are_one_line(
-    data: Path, tmp_path: Path, arguments: list[str], message: str
-) -> None:
+def test_mistakes_are_one_line(data, tmp_path, arguments, message):
     done = measured(data, tmp_path, *arguments)
     assert done.returncode == 2
     assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_a_case_of_one_touch_is_refused(data: Path, tmp_path: Path) -> None:
+def test_a_case_of_one_touch_is_refused(data, tmp_path):
     done = measured(data, tmp_path, case="one")
     assert done.returncode == 2
     assert "one has 1 touches; accepted: from 2" in done.stderr
 
 
-def test_real_touches_and_a_depth_image_are_measured(real_directory: Path, tmp_path: Path) -> None:
+def test_real_touches_and_a_depth_image_are_measured(real_directory, tmp_path):
     folder = real_directory.parent
     cases = "only=[icub_cylinder,gelatin_box]"
     words = [f"data={folder}", f"out={tmp_path}", "methods=icp", "seeds=0", cases]

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -10,7 +8,7 @@ from chsel.errors import RecordingError
 from chsel.methods import build_method
 from chsel.numerics.arrays import digest
 from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.registration_problem import ArchiveSnapshot, RegistrationProblem
+from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from replay.events import Event, Recorder, SnapshotTaken, Traced
@@ -20,7 +18,7 @@ from runners.run.recording import make_run_folder
 
 
 @pytest.mark.parametrize("name", ["ycb/drill", "../../x", "a\0b", "x" * 5000, "a b\n"])
-def test_run_folders_differ_and_stay_in_the_log_folder(tmp_path: Path, name: str) -> None:
+def test_run_folders_differ_and_stay_in_the_log_folder(tmp_path, name):
     folders = {make_run_folder(tmp_path, name, "chsel") for _ in range(3)}
     assert len(folders) == 3
     assert {folder.parent for folder in folders} == {tmp_path}
@@ -32,21 +30,21 @@ def test_run_folders_differ_and_stay_in_the_log_folder(tmp_path: Path, name: str
 class Keeping(Recorder):
     """Keeps events, and the digests of their arrays at the moment they came."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.events: list[Event] = []
         self.digests: list[str] = []
 
-    def record(self, event: Event) -> None:
+    def record(self, event):
         if isinstance(event, SnapshotTaken):
             self.events.append(event)
             self.digests.append(digest(*arrays(event.archive)))
 
 
-def arrays(archive: ArchiveSnapshot) -> list[np.ndarray]:
+def arrays(archive):
     return [value for value in vars(archive).values() if isinstance(value, np.ndarray)]
 
 
-def test_what_is_handed_over_is_never_changed() -> None:
+def test_what_is_handed_over_is_never_changed():
     """A recorder may write a snapshot while the search goes on."""
     box = trimesh.creation.box((0.1, 0.06, 0.2))
     surface = np.asarray(trimesh.sample.sample_surface(box, 10, seed=0)[0])
@@ -69,7 +67,7 @@ def test_what_is_handed_over_is_never_changed() -> None:
 
 
 @pytest.mark.parametrize("count", [4, 5])
-def test_a_trace_is_of_the_moment_at_which_it_was_handed_over(count: int) -> None:
+def test_a_trace_is_of_the_moment_at_which_it_was_handed_over(count):
     recorder = ListRecorder()
     random = np.random.default_rng(count)
     vectors, cost = random.normal(size=(count, 9)), random.uniform(size=count)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -21,7 +20,7 @@ from tests.runners.made_up_evaluations import row, tables_of, write_evaluation, 
 SUMMARY = "PD and its ratios over all registrations"
 
 
-def test_the_last_half_is_that_of_all_methods_of_a_trial() -> None:
+def test_the_last_half_is_that_of_all_methods_of_a_trial():
     rows = [row("can", 0, "chsel", step) for step in (3, 4, 5, 6)]
     rows += [row("can", 0, "icp", step) for step in (7, 8)] + [row("can", 1, "icp", 3)]
     kept = last_half(pd.DataFrame(rows))[["seed", "method", "step"]]
@@ -33,7 +32,7 @@ def test_the_last_half_is_that_of_all_methods_of_a_trial() -> None:
     ]
 
 
-def test_quartiles_are_of_the_numbers_that_there_are() -> None:
+def test_quartiles_are_of_the_numbers_that_there_are():
     numbers = {"a": [4.0, None, 1.0, None, 3.0, 2.0], "b": [2.5, 2.5], "c": [None, None, None]}
     rows = [{"of": of, "number": value} for of, values in numbers.items() for value in values]
     found = spreads(pd.DataFrame(rows), "of", "number")
@@ -47,7 +46,7 @@ def test_quartiles_are_of_the_numbers_that_there_are() -> None:
     ]
 
 
-def test_tables_hold_medians_over_trials_and_the_last_half_of_their_steps(tmp_path: Path) -> None:
+def test_tables_hold_medians_over_trials_and_the_last_half_of_their_steps(tmp_path):
     values = {0: (1000.0, 10.0, 20.0), 1: (1000.0, 30.0, 60.0)}  # PD of seeds at steps 4, 5, 6
     rows = [
         row("can", seed, method, step, diversity=factor * value, seconds=0.01 * factor)
@@ -68,7 +67,7 @@ def test_tables_hold_medians_over_trials_and_the_last_half_of_their_steps(tmp_pa
     ]
 
 
-def test_what_has_no_number_is_left_out_and_counted(tmp_path: Path) -> None:
+def test_what_has_no_number_is_left_out_and_counted(tmp_path):
     rows = [
         row("can", 0, "chsel", 4, diversity=8.0, seconds=0.1),
         row("can", 1, "chsel", 4, seconds=0.3) | {"status": "no plausible set: too few points"},
@@ -95,7 +94,7 @@ def test_what_has_no_number_is_left_out_and_counted(tmp_path: Path) -> None:
     ]
 
 
-def test_true_poses_that_were_sought_have_a_table_of_their_own(tmp_path: Path) -> None:
+def test_true_poses_that_were_sought_have_a_table_of_their_own(tmp_path):
     names = ["cabinet_drill", "cabinet_mustard"]
     write_evaluation(tmp_path, [], configurations=names, seeds=[0, 1, 2])
     for index, (name, seed) in enumerate([(names[0], 0), (names[0], 1), (names[1], 0)]):
@@ -114,7 +113,7 @@ def test_true_poses_that_were_sought_have_a_table_of_their_own(tmp_path: Path) -
 
 
 @pytest.fixture
-def compared(tmp_path: Path) -> Path:
+def compared(tmp_path):
     """Two draws of the package and of an anchored method, at two steps of a trial."""
     numbers = {"exact_members": 0.5, "distinct": 30, "seconds": 0.1}
     found = [
@@ -133,9 +132,7 @@ def compared(tmp_path: Path) -> Path:
     return write_evaluation(tmp_path / "evaluation", rows, **planned)
 
 
-def test_ratios_are_of_the_same_trial_and_step_by_the_mean_of_the_baselines_draws(
-    compared: Path,
-) -> None:
+def test_ratios_are_of_the_same_trial_and_step_by_the_mean_of_the_baselines_draws(compared):
     tables = tables_of(compared, "package")
     header, own, package = tables[SUMMARY]
     assert dict(zip(header, own, strict=True)) == {
@@ -157,7 +154,7 @@ def test_ratios_are_of_the_same_trial_and_step_by_the_mean_of_the_baselines_draw
     assert tables["Ratios of PD by object, geometric means"][1] == ["can", "0.126", "1"]
 
 
-def test_a_pd_equal_to_the_baselines_is_not_worse(tmp_path: Path) -> None:
+def test_a_pd_equal_to_the_baselines_is_not_worse(tmp_path):
     values = {"package": 8.0, "icp": 8.0, "svgd": 8.1, "cvo": 7.9}
     rows = [row("can", 0, method, 4, diversity=value) for method, value in values.items()]
     header, *lines = tables_of(write_evaluation(tmp_path, rows), "package")[SUMMARY]
@@ -165,9 +162,7 @@ def test_a_pd_equal_to_the_baselines_is_not_worse(tmp_path: Path) -> None:
     assert shares == {"SVGD": "100.0 %", "ICP": "0.0 %", "CVO": "0.0 %", "package": "-"}
 
 
-def test_pd_over_probes_is_the_median_and_quartiles_of_each_object_and_step(
-    tmp_path: Path,
-) -> None:
+def test_pd_over_probes_is_the_median_and_quartiles_of_each_object_and_step(tmp_path):
     numbers = {"can": {4: (16.0, 1.0, 4.0), 5: (25.0, 9.0)}, "box": {5: (100.0, 400.0)}}
     rows = [
         row(name, seed, method, step, diversity=factor * value)
@@ -190,9 +185,7 @@ def test_pd_over_probes_is_the_median_and_quartiles_of_each_object_and_step(
     ]
 
 
-def test_each_panel_over_iterations_draws_its_own_number_and_costs_of_one_kind(
-    tmp_path: Path,
-) -> None:
+def test_each_panel_over_iterations_draws_its_own_number_and_costs_of_one_kind(tmp_path):
     methods = {"chsel": 1.0, "chsel_cma_me": 2.0, "medial_constraint_cma_me": 1000.0}
     about = {"configuration": "drill", "step": 4}
     moments = [
@@ -217,9 +210,7 @@ def test_each_panel_over_iterations_draws_its_own_number_and_costs_of_one_kind(
 
 
 @pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
-def test_a_report_has_its_pictures_its_data_and_the_same_bytes_each_time(
-    compared: Path, kind: str
-) -> None:
+def test_a_report_has_its_pictures_its_data_and_the_same_bytes_each_time(compared, kind):
     contents = []
     for out in ("first", "again"):
         arguments = (f"out={compared / out}", f"format={kind}", "baseline=package")
@@ -238,7 +229,7 @@ def test_a_report_has_its_pictures_its_data_and_the_same_bytes_each_time(
     assert SUMMARY in done.stdout
 
 
-def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(tmp_path: Path) -> None:
+def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(tmp_path):
     planned = {"configurations": ["can"], "seeds": [0], "methods": {"icp": {}, "svgd": {}}}
     write_evaluation(tmp_path, None, **planned)
     trial = tmp_path / "trials" / "can" / "seed_0"
@@ -253,7 +244,7 @@ def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(tmp_path: Pat
 
 
 @pytest.mark.parametrize("rows", [[], [row("a@#$|<b>", 0, "own *$_", 4, seconds=0.0)]])
-def test_there_is_a_report_on_little(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
+def test_there_is_a_report_on_little(tmp_path, rows):
     done = run(report.main, str(write_evaluation(tmp_path, rows, name="<$own_$>")))
     assert (done.returncode, done.stderr) == (0, "")
     assert "<h1>Evaluation &lt;$own_$&gt;</h1>" in (tmp_path / "report/report.html").read_text()
@@ -269,7 +260,7 @@ def test_there_is_a_report_on_little(tmp_path: Path, rows: list[dict[str, Any]])
         (["{}", "out={}/experiment.json/x"], "accepted: an out=DIR that can be written"),
     ],
 )
-def test_a_mistake_is_one_line(tmp_path: Path, arguments: list[str], message: str) -> None:
+def test_a_mistake_is_one_line(tmp_path, arguments, message):
     write_evaluation(tmp_path, [row("can", 0, "chsel", 4, diversity=1.0)])
     done = run(report.main, *(argument.format(tmp_path) for argument in arguments))
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)

@@ -38,7 +38,7 @@ class Scene:
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+def scene(tmp_path_factory):
     plan = plan_in(tmp_path_factory.mktemp("session"))
     assert do_task(plan, Task(TRIAL)) == ""
     session = open_recorded(plan, TRIAL)
@@ -52,7 +52,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return Scene(rows, session, truth, problem, members, cost)
 
 
-def hypotheses(world_from_object: FloatArray) -> Hypotheses:
+def hypotheses(world_from_object):
     """These poses (B, 4, 4), the best first."""
     count = len(world_from_object)
     poses = inverse(world_from_object)
@@ -60,13 +60,13 @@ def hypotheses(world_from_object: FloatArray) -> Hypotheses:
     return Hypotheses(poses, np.arange(float(count)), np.zeros(count, dtype=bool), cell, poses)
 
 
-def moved(truth: FloatArray, shifts: FloatArray, turns: FloatArray) -> FloatArray:
+def moved(truth, shifts, turns):
     """The true pose moved by shifts (B, 3) and turned by rotation vectors (B, 3)."""
     rotation = product(rotation_vector(turns), truth[:3, :3])
     return compose(rotation, truth[:3, 3] + shifts)
 
 
-def test_errors_are_those_of_the_best_hypothesis(scene: Scene) -> None:
+def test_errors_are_those_of_the_best_hypothesis(scene):
     shifts = np.array([[0.012, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.0, 0.1]])
     turns = np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [0.3, 0.0, 0.0]])
     shifted = hypotheses(moved(scene.truth, shifts, turns))
@@ -80,7 +80,7 @@ def test_errors_are_those_of_the_best_hypothesis(scene: Scene) -> None:
     assert (row["hypotheses"], row["distinct"]) == (3, 3)
 
 
-def test_exact_members_are_those_within_one_epsilon_of_the_true_cost(scene: Scene) -> None:
+def test_exact_members_are_those_within_one_epsilon_of_the_true_cost(scene):
     stream = np.random.default_rng(0)
     shifts, turns = stream.normal(0.0, 0.003, (4000, 3)), stream.normal(0.0, 0.02, (4000, 3))
     poses = moved(scene.truth, shifts, turns)
@@ -94,19 +94,17 @@ def test_exact_members_are_those_within_one_epsilon_of_the_true_cost(scene: Scen
     assert row["exact_members"] == pytest.approx(3.0 / 12.0)
 
 
-def test_all_steps_of_a_session_are_measured_by_the_same_points_on_the_surface(
-    scene: Scene,
-) -> None:
+def test_all_steps_of_a_session_are_measured_by_the_same_points_on_the_surface(scene):
     stream = np.random.default_rng(1)
     found = hypotheses(moved(scene.truth, stream.normal(0.0, 0.02, (5, 3)), np.zeros((5, 3))))
     mesh = scene.session.recorded.mesh
 
-    def measured(metrics: HypothesisMetrics, seed: int, step: int) -> dict[str, float]:
+    def measured(metrics, seed, step):
         return metrics.compute(
             replace(scene.problem, key=StreamKey(seed, step)), scene.members, found
         )
 
-    def fresh() -> HypothesisMetrics:
+    def fresh():
         return HypothesisMetrics(MetricsConfig(points=50), mesh, scene.truth)
 
     one = fresh()
@@ -116,7 +114,7 @@ def test_all_steps_of_a_session_are_measured_by_the_same_points_on_the_surface(
     assert measured(fresh(), 1, 4)["diversity"] != first["diversity"]
 
 
-def test_seeds_of_draws_are_no_seeds_of_other_sessions() -> None:
+def test_seeds_of_draws_are_no_seeds_of_other_sessions():
     seeds = range(50)
     assert [repeat_seed(seed, 0) for seed in seeds] == list(seeds)
     drawn = {repeat_seed(seed, draw) for seed in seeds for draw in range(20)}

@@ -1,19 +1,13 @@
 """The command and the library give the same bits for the same points, mesh and seed."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import trimesh
 
 import chsel
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, axis_angle, compose
 from replay.events import Measured
-from replay.mcap.reader import Recording, read_recording
+from replay.mcap.reader import read_recording
 from runners.objects.loader import load_model
 from runners.probe import main
 from tests.runners.in_process import run
@@ -22,13 +16,13 @@ POSE = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(0.5)), np.array([0
 
 
 @pytest.fixture(scope="module")
-def mesh_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def mesh_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("mesh") / "mustard.ply"
     load_model("mustard").export(path)
     return path
 
 
-def known(mesh: trimesh.Trimesh) -> dict[str, FloatArray]:
+def known(mesh):
     """Points of every class on, in and around a mesh at POSE."""
     surface = trimesh.sample.sample_surface(mesh, 24, seed=0)[0]
     around = np.random.default_rng(0).uniform(-0.2, 0.2, (2000, 3)) + mesh.bounds.mean(axis=0)
@@ -39,7 +33,7 @@ def known(mesh: trimesh.Trimesh) -> dict[str, FloatArray]:
     return {name: apply(POSE, group) for name, group in points.items()}
 
 
-def recorded(folder: Path, mesh_file: Path, points: dict[str, Any], *overrides: str) -> Recording:
+def recorded(folder, mesh_file, points, *overrides):
     """What the command records, with its default settings but for the folders."""
     np.savez(folder / "points.npz", **points)
     chosen = ["session=points", f"session.path={folder / 'points.npz'}", "object=mesh"]
@@ -51,7 +45,7 @@ def recorded(folder: Path, mesh_file: Path, points: dict[str, Any], *overrides: 
 
 
 @pytest.mark.parametrize("method", ["chsel", "anchored"])
-def test_a_file_of_points_and_the_same_arrays(tmp_path: Path, mesh_file: Path, method: str) -> None:
+def test_a_file_of_points_and_the_same_arrays(tmp_path, mesh_file, method):
     mesh = chsel.load_mesh(mesh_file)
     points = known(mesh)
     beside = {"known": points["surface"][:3] + 0.001, "known_sdf": np.array([0.0, 0.001, -0.001])}
@@ -64,7 +58,7 @@ def test_a_file_of_points_and_the_same_arrays(tmp_path: Path, mesh_file: Path, m
     assert measured.values.items() >= found.trust.numbers.items()
 
 
-def test_a_sequence_in_the_workspace_of_all_its_points(tmp_path: Path, mesh_file: Path) -> None:
+def test_a_sequence_in_the_workspace_of_all_its_points(tmp_path, mesh_file):
     mesh = chsel.load_mesh(mesh_file)
     points = known(mesh)
     steps = {f"{name}_step": np.arange(len(group)) % 2 for name, group in points.items()}

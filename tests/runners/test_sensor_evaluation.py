@@ -1,11 +1,7 @@
 """Evaluations of sessions whose raw logs are read: which there are, and their true poses."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +15,7 @@ from replay.events import RigDescribed
 from replay.mcap.reader import read_recording
 from runners import evaluate
 from runners.command.choices import CONF
-from runners.evaluation.plan import Plan, Task, Trial
+from runners.evaluation.plan import Task, Trial
 from runners.evaluation.trial_configurations import chosen_names, configurations_of
 from runners.evaluation.trial_session import open_recorded, read_told
 from runners.evaluation.true_poses import (
@@ -37,7 +33,7 @@ CABINET = ["cabinet_drill", "cabinet_drill_opposite", "cabinet_mustard", "cabine
 POSE = compose(rotation_vector(np.array([0.31, -0.4, 1.1])), np.array([0.913, -0.046, 0.338]))
 
 
-def sensors_plan(folder: Path, **changes: Any) -> Plan:
+def sensors_plan(folder, **changes):
     """A plan of sessions of the simulated robot's rig."""
     rig = yaml.safe_load((CONF / "session" / "rig" / "cabinet.yaml").read_text())
     session = {"kind": "sensors", "rig": rig, "start_contacts": 1, "start_probe": 0}
@@ -45,7 +41,7 @@ def sensors_plan(folder: Path, **changes: Any) -> Plan:
     return replace(plan_in(folder), session=session, steps=None, truth=truth, **changes)
 
 
-def own_logs(folder: Path, **objects: dict[str, Any]) -> Path:
+def own_logs(folder, **objects):
     """A folder of logs of one's own, which are empty files here."""
     for name, values in objects.items():
         (folder / name).mkdir(parents=True)
@@ -54,7 +50,7 @@ def own_logs(folder: Path, **objects: dict[str, Any]) -> Path:
     return folder
 
 
-def test_configurations_are_simulated_unless_there_are_logs_of_ones_own(tmp_path: Path) -> None:
+def test_configurations_are_simulated_unless_there_are_logs_of_ones_own(tmp_path):
     assert list(configurations_of("sensors")) == CABINET
     assert [one.probes for one in configurations_of("sensors").values()] == [6, 6, 6, 6]
     (tmp_path / "cabinet_drill").mkdir()
@@ -70,7 +66,7 @@ def test_configurations_are_simulated_unless_there_are_logs_of_ones_own(tmp_path
         chosen_names("configurations", "box", own, objects)
 
 
-def test_objects_of_logs_are_of_real_size_unless_their_file_says_otherwise(tmp_path: Path) -> None:
+def test_objects_of_logs_are_of_real_size_unless_their_file_says_otherwise(tmp_path):
     plan = sensors_plan(tmp_path)
     assert plan.object_config("cabinet_drill").scale == 1.0
     assert plan.object_config("cabinet_drill").epsilon == 0.001
@@ -89,7 +85,7 @@ def test_objects_of_logs_are_of_real_size_unless_their_file_says_otherwise(tmp_p
     assert drill.steps_of("cabinet_drill") == (1, 4), "those of the steps that it has"
 
 
-def test_a_folder_of_logs_must_name_its_object(tmp_path: Path) -> None:
+def test_a_folder_of_logs_must_name_its_object(tmp_path):
     (tmp_path / "shelf").mkdir()
     with pytest.raises(
         SettingError, match=r"object.yaml: cannot .*; accepted: a choice of object="
@@ -102,7 +98,7 @@ def test_a_folder_of_logs_must_name_its_object(tmp_path: Path) -> None:
         configurations_of("sensors", tmp_path / "none")
 
 
-def test_logs_of_ones_own_need_a_guess_and_simulated_ones_are_made(tmp_path: Path) -> None:
+def test_logs_of_ones_own_need_a_guess_and_simulated_ones_are_made(tmp_path):
     logs = own_logs(tmp_path / "logs", shelf={"name": "mustard"})
     plan, trial = sensors_plan(tmp_path, logs=logs), Trial(0, "shelf")
     assert not is_missing(plan, trial)
@@ -121,7 +117,7 @@ def test_logs_of_ones_own_need_a_guess_and_simulated_ones_are_made(tmp_path: Pat
     assert trial.log(simulated) == simulated.folder / "logs" / "shelf" / "seed_0.mcap"
 
 
-def test_a_pose_set_by_hand_is_near_the_truth_but_not_it() -> None:
+def test_a_pose_set_by_hand_is_near_the_truth_but_not_it():
     hand = as_set_by_hand(POSE)
     np.testing.assert_allclose(hand[:3, 3], [0.91, -0.05, 0.34], atol=1e-12)
     assert 0.0 < rotation_angle((inverse(POSE) @ hand)[:3, :3]) < 0.16
@@ -141,9 +137,7 @@ def test_a_pose_set_by_hand_is_near_the_truth_but_not_it() -> None:
         (("session=sensors", "session.logs=LOGS", "seeds=4"), "seed_4.mcap; accepted: seeds"),
     ],
 )
-def test_an_evaluation_of_logs_that_cannot_be_is_one_line(
-    tmp_path: Path, arguments: tuple[str, ...], message: str
-) -> None:
+def test_an_evaluation_of_logs_that_cannot_be_is_one_line(tmp_path, arguments, message):
     logs = own_logs(tmp_path / "logs", shelf={"name": "mustard"})
     words = [word.replace("LOGS", str(logs)) for word in arguments]
     done = run(evaluate.main, *words, f"out={tmp_path / 'out'}")
@@ -153,9 +147,7 @@ def test_an_evaluation_of_logs_that_cannot_be_is_one_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_trial_gets_its_log_its_true_pose_and_its_results(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_trial_gets_its_log_its_true_pose_and_its_results(tmp_path, monkeypatch):
     pytest.importorskip("pybullet")
     from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
 

@@ -1,9 +1,5 @@
 """The command that simulates a robot's log, as a user runs it."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import yaml
@@ -28,7 +24,7 @@ SHORT = ("probes=1", "push_steps=1", "standing=0.1", "dwell=0.1")
 QUICK = (*SHORT, "camera.width=32", "bubbles.width=32")
 
 
-def test_a_log_and_its_truth_are_written(tmp_path: Path) -> None:
+def test_a_log_and_its_truth_are_written(tmp_path):
     pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
     log = tmp_path / "new" / "log.mcap"
     done = run(simulate_rig.main, f"out={log}", "configuration=cabinet_mustard", "seed=4", *QUICK)
@@ -68,9 +64,7 @@ def test_a_log_and_its_truth_are_written(tmp_path: Path) -> None:
         (("out=x.mcap", "object=drill", "object.scale=2.5"), "more than the cabinet has"),
     ],
 )
-def test_a_mistake_is_one_line(
-    arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mistake_is_one_line(arguments, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     done = run(simulate_rig.main, *arguments)
     assert done.returncode == 2
@@ -79,7 +73,7 @@ def test_a_mistake_is_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_the_rig_of_the_cabinet_describes_the_twin() -> None:
+def test_the_rig_of_the_cabinet_describes_the_twin():
     values = yaml.safe_load((CONF / "session" / "rig" / "cabinet.yaml").read_text())
     rig = build_settings(Rig, values, "rig")
     assert rig.world == WORLD

@@ -1,7 +1,5 @@
 """The first moments of a command."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import shutil
@@ -38,9 +36,7 @@ sys.meta_path.insert(0, Interrupts())
 """
 
 
-def ran(
-    words: list[str], folder: Path, code: str, **changes: str
-) -> subprocess.CompletedProcess[str]:
+def ran(words, folder, code, **changes):
     """`python -m words`, with code that Python runs before anything else."""
     (folder / "sitecustomize.py").write_text(code)
     environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{REPOSITORY}", **changes}
@@ -49,14 +45,14 @@ def ran(
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_help(command: str) -> None:
+def test_every_command_has_help(command):
     done = run(importlib.import_module(f"runners.{command}").main, "--help")
     assert (done.returncode, done.stderr) == (0, "")
     assert f"python -m runners.{command}" in done.stdout
     assert "== Settings" in done.stdout
 
 
-def test_help_shows_the_choices_made_and_mistakes_are_errors() -> None:
+def test_help_shows_the_choices_made_and_mistakes_are_errors():
     done = run(probe.main, "object=mustard", "method=icp", "seed=3", "-h")
     for shown in ("name: icp", "name: mustard", "seed: 3", "ycb/drill", "method=anchored|chsel|"):
         assert shown in done.stdout
@@ -66,7 +62,7 @@ def test_help_shows_the_choices_made_and_mistakes_are_errors() -> None:
 
 
 @pytest.mark.parametrize("verb", ["", *VERBS])
-def test_help_of_replay_waits_for_no_heavy_import(verb: str, tmp_path: Path) -> None:
+def test_help_of_replay_waits_for_no_heavy_import(verb, tmp_path):
     done = ran(["replay", *([verb] if verb else []), "--help"], tmp_path, LISTED)
     assert (done.returncode, done.stderr) == (0, "[]\n")
     assert "usage: replay" in done.stdout
@@ -101,7 +97,7 @@ print([name for name in sys.argv[0].split() if name in sys.modules])
 """
 
 
-def test_registrations_import_nothing_that_they_do_not_need() -> None:
+def test_registrations_import_nothing_that_they_do_not_need():
     unwanted = " ".join(
         (
             *HEAVY,
@@ -133,16 +129,14 @@ def test_registrations_import_nothing_that_they_do_not_need() -> None:
     ],
     ids=str,
 )
-def test_ctrl_c_during_imports_ends_a_command_quietly(
-    words: list[str], module: str, tmp_path: Path
-) -> None:
+def test_ctrl_c_during_imports_ends_a_command_quietly(words, module, tmp_path):
     done = ran(words, tmp_path, INTERRUPTED.format(module=module))
     assert done.returncode == -signal.SIGINT  # which a shell shows as 130
     assert done.stderr == ""
 
 
 @pytest.mark.skipif(os.name == "nt", reason="there are no such signals on Windows")
-def test_ctrl_c_stays_ignored_where_it_was(tmp_path: Path) -> None:
+def test_ctrl_c_stays_ignored_where_it_was(tmp_path):
     code = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
     code += INTERRUPTED.format(module="numba")
     done = ran(["replay", "verify", "x.mcap"], tmp_path, code)
@@ -150,9 +144,7 @@ def test_ctrl_c_stays_ignored_where_it_was(tmp_path: Path) -> None:
     assert "x.mcap does not exist" in done.stderr
 
 
-def test_processes_of_a_console_script_import_nothing_from_the_current_folder(
-    tmp_path: Path,
-) -> None:
+def test_processes_of_a_console_script_import_nothing_from_the_current_folder(tmp_path):
     """Such as Dask's."""
     script, folder = tmp_path / "bin" / "chsel-probe", tmp_path / "here"
     script.parent.mkdir()
@@ -165,7 +157,7 @@ def test_processes_of_a_console_script_import_nothing_from_the_current_folder(
     assert sorted(path.name for path in folder.iterdir()) == ["multiprocessing.py", "numba.py"]
 
 
-def test_the_published_package_in_our_place_is_named(tmp_path: Path) -> None:
+def test_the_published_package_in_our_place_is_named(tmp_path):
     """As pip leaves it, or as it shadows an editable installation."""
     theirs = tmp_path / "chsel"
     theirs.mkdir()
@@ -177,7 +169,7 @@ def test_the_published_package_in_our_place_is_named(tmp_path: Path) -> None:
         assert done.stderr == f"error: {WRONG_PACKAGE.format(theirs)}\n"
 
 
-def test_files_of_the_published_package_among_ours_are_named(tmp_path: Path) -> None:
+def test_files_of_the_published_package_among_ours_are_named(tmp_path):
     shutil.copytree(REPOSITORY / "chsel", tmp_path / "chsel")
     (tmp_path / "chsel" / "wrapper.py").touch()
     done = ran(["replay", "info", "x.mcap"], tmp_path, "")

@@ -1,11 +1,7 @@
 """`python -m runners.evaluate` with policies: small sessions for real, their rows and a report."""
 
-from __future__ import annotations
-
 import json
 import re
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow.parquet
@@ -15,7 +11,6 @@ from chsel.errors import SettingError
 from chsel.methods.anchored.anchored import Anchored
 from chsel.problem.outline import outline_in_world
 from chsel.problem.poses import Poses, apply, inverse
-from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from replay.mcap.reader import read_recording
 from runners import evaluate, probe
 from runners.evaluation.contenders import chosen_policies
@@ -41,7 +36,7 @@ LABELS = ("grid", "information")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A finished evaluation of two policies on two configurations."""
     folder = tmp_path_factory.mktemp("steered") / "out"
     done = run(evaluate.main, *SMALL, POLICIES, f"out={folder}")
@@ -52,11 +47,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def rows_of(folder: Path) -> list[dict[str, Any]]:
+def rows_of(folder):
     return pyarrow.parquet.read_table(folder / "probes.parquet").to_pylist()
 
 
-def test_every_probe_has_a_row_that_the_recording_confirms(folder: Path) -> None:
+def test_every_probe_has_a_row_that_the_recording_confirms(folder):
     rows = rows_of(folder)
     keys = [(row["configuration"], row["policy"], row["probes"]) for row in rows]
     names = [("can", "cracker_box"), ("mustard", "mustard")]
@@ -82,12 +77,12 @@ def test_every_probe_has_a_row_that_the_recording_confirms(folder: Path) -> None
             assert {row[name] for name in ("action", "hit_forecast", "decision_seconds")} == {None}
 
 
-def mean_error(start: Any, poses: np.ndarray) -> np.ndarray:
+def mean_error(start, poses):
     """Distances (B,) of poses (B, 4, 4) from the true one, over points of both surfaces."""
     truth = inverse(start.world_from_object[None])
     places = outline_in_world(start.sdf, Poses.of(np.concatenate([poses, truth])))
 
-    def squares(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    def squares(pose, points):
         return start.sdf.at(apply(pose, points), lookup="trilinear")[0] ** 2
 
     both = [
@@ -97,7 +92,7 @@ def mean_error(start: Any, poses: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(both, axis=(1, 2)))
 
 
-def check_decision(row: dict[str, Any], recording: Any) -> None:
+def check_decision(row, recording):
     """The forecasts are those of the decision before the probe, the rest of the one after it."""
     before, after = (recording.decision(row["step"] - 1), recording.decision(row["step"]))
     chosen = before.decision.chosen
@@ -115,13 +110,13 @@ def check_decision(row: dict[str, Any], recording: Any) -> None:
     assert row["decision_seconds"] > 0.0
 
 
-def test_the_usual_rules_stop_at_a_narrow_belief_or_where_little_is_promised() -> None:
+def test_the_usual_rules_stop_at_a_narrow_belief_or_where_little_is_promised():
     assert usual_stop(0.004, 0.05) == "spread"
     assert usual_stop(0.1, 0.0001) == "gain"
     assert usual_stop(0.1, 0.05) == usual_stop(0.1, None) == ""
 
 
-def test_sessions_are_those_of_runners_probe(folder: Path, tmp_path: Path) -> None:
+def test_sessions_are_those_of_runners_probe(folder, tmp_path):
     done = run(
         probe.main,
         *("object=mustard", "session=kinematic", "seed=20", "recording=mcap"),
@@ -144,7 +139,7 @@ def test_sessions_are_those_of_runners_probe(folder: Path, tmp_path: Path) -> No
     ]
 
 
-def test_what_is_finished_is_not_done_again_and_policies_may_become_more(folder: Path) -> None:
+def test_what_is_finished_is_not_done_again_and_policies_may_become_more(folder):
     before = stamps(folder)
     again = run(evaluate.main, *SMALL, POLICIES, f"out={folder}")
     assert "4 tasks, of which 4 are finished" in again.stdout
@@ -154,7 +149,7 @@ def test_what_is_finished_is_not_done_again_and_policies_may_become_more(folder:
     assert told["policies"]["grid"]["settings"]["probes"] == 3
 
 
-def test_policies_that_do_not_exist_are_refused() -> None:
+def test_policies_that_do_not_exist_are_refused():
     for policies, settings, message in (
         (["grid", "informative"], {}, "policy is 'informative'"),
         ("grid,grid", {}, "policies has grid twice"),
@@ -165,7 +160,7 @@ def test_policies_that_do_not_exist_are_refused() -> None:
             chosen_policies(policies, settings)
 
 
-def test_a_policy_has_the_changes_of_all_and_its_own() -> None:
+def test_a_policy_has_the_changes_of_all_and_its_own():
     fine = {"name": "information", "label": "fine", "settings": {"noise": 0.001}}
     found = chosen_policies(["information#a", fine], {"probes": 5, "noise": 0.004})
     settings = {label: one.policy().settings for label, one in found.items()}
@@ -187,19 +182,17 @@ def test_a_policy_has_the_changes_of_all_and_its_own() -> None:
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
-def test_a_mistake_is_one_line_on_stderr(folder: Path, arguments: list[str], message: str) -> None:
+def test_a_mistake_is_one_line_on_stderr(folder, arguments, message):
     before = stamps(folder)
     done = run(evaluate.main, *SMALL, POLICIES, f"out={folder}", *arguments)
     assert (done.returncode, message in done.stderr) == (2, True), done.stderr
     assert stamps(folder) == before
 
 
-def test_a_registration_that_fails_is_a_row_with_the_error_of_the_one_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_registration_that_fails_is_a_row_with_the_error_of_the_one_before(tmp_path, monkeypatch):
     register = Anchored.register
 
-    def sometimes(method: Anchored, problem: RegistrationProblem, *observer: Any) -> Hypotheses:
+    def sometimes(method, problem, *observer):
         if problem.key.step == 1:
             raise ValueError("no luck")
         return register(method, problem, *observer)
@@ -213,7 +206,7 @@ def test_a_registration_that_fails_is_a_row_with_the_error_of_the_one_before(
         plausible=False,
         recordings=False,
     )
-    plan.session.update(start_contacts=1, start_probe=0)  # type: ignore[attr-defined]
+    plan.session.update(start_contacts=1, start_probe=0)
     join_experiment(plan, "test", ["mustard"], [20])
     assert do_task(plan, Task(Trial(20, "mustard"), "grid")) == ""
     first, second = collect(plan.folder).to_pylist()

@@ -1,9 +1,5 @@
 """Reports on policies: statistics of sessions with known answers, and the page."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,7 +8,6 @@ from runners import report
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.sections import sections_of
 from runners.reporting.statistics import (
-    SteeredSessions,
     bootstrap_interval,
     geometric_means,
     paired,
@@ -20,17 +15,17 @@ from runners.reporting.statistics import (
     steered_sessions,
 )
 from tests.runners.in_process import run
-from tests.runners.made_up_evaluations import Row, session, tables_of, write_sessions
+from tests.runners.made_up_evaluations import session, tables_of, write_sessions
 
 BUDGETS = {"information": 4, "grid": 4}
 
 
-def sessions_of(folder: Path, rows: list[Row], reference: str | None = None) -> SteeredSessions:
+def sessions_of(folder, rows, reference=None):
     return steered_sessions(open_evaluation(write_sessions(folder, rows, BUDGETS)), reference)
 
 
 @pytest.fixture
-def rows() -> list[Row]:
+def rows():
     """Three trials of two policies."""
     forecasts = {"hit_forecast": [0.95, 0.85, 0.15, 0.85], "hit": [True, True, False, False]}
     return [
@@ -43,7 +38,7 @@ def rows() -> list[Row]:
     ]
 
 
-def test_a_session_that_ends_early_keeps_its_error(tmp_path: Path, rows: list[Row]) -> None:
+def test_a_session_that_ends_early_keeps_its_error(tmp_path, rows):
     found = sessions_of(tmp_path, rows)
     assert found.errors.loc[("information", "can", 21)].tolist() == pytest.approx(
         [0.05, 0.025, 0.009, 0.009]
@@ -56,9 +51,7 @@ def test_a_session_that_ends_early_keeps_its_error(tmp_path: Path, rows: list[Ro
     assert ratios[3] == pytest.approx((4.0 * 9.0 * 60.0 / (20.0 * 30.0 * 65.0)) ** (1 / 3))
 
 
-def test_policies_are_compared_in_the_trials_that_all_have_finished(
-    tmp_path: Path, rows: list[Row]
-) -> None:
+def test_policies_are_compared_in_the_trials_that_all_have_finished(tmp_path, rows):
     more = session("drill", 21, "grid", [1.0, 1.0, 1.0, 1.0])
     failed = {**more[0], "policy": "information", "probes": None, "step": None, "error": None}
     failed |= {"status": "failed: out of memory"}
@@ -67,7 +60,7 @@ def test_policies_are_compared_in_the_trials_that_all_have_finished(
     assert ("drill", 21) not in found.solvable
 
 
-def test_ratios_are_by_session_with_wins_and_an_interval(tmp_path: Path, rows: list[Row]) -> None:
+def test_ratios_are_by_session_with_wins_and_an_interval(tmp_path, rows):
     of = paired(sessions_of(tmp_path, rows), "grid")
     # Of 10 by 2 mm, 3 by 9 mm and 30 by 60 mm.
     assert [of[name] for name in ("sessions", "wins", "losses", "sign_test")] == [3, 1, 2, 1.0]
@@ -80,7 +73,7 @@ def test_ratios_are_by_session_with_wins_and_an_interval(tmp_path: Path, rows: l
     assert (back["wins"], back["losses"]) == (of["losses"], of["wins"])
 
 
-def test_the_interval_of_a_mean_is_that_of_independent_configurations() -> None:
+def test_the_interval_of_a_mean_is_that_of_independent_configurations():
     values = np.random.default_rng(0).normal(2.0, 1.0, 200)
     index = pd.MultiIndex.from_product([range(200), [0, 1, 2]], names=["configuration", "seed"])
     lower, upper = bootstrap_interval(pd.Series(np.repeat(values, 3), index))
@@ -89,7 +82,7 @@ def test_the_interval_of_a_mean_is_that_of_independent_configurations() -> None:
     assert upper == pytest.approx(values.mean() + half, abs=0.02)
 
 
-def test_tables_have_the_numbers_of_the_sessions(tmp_path: Path, rows: list[Row]) -> None:
+def test_tables_have_the_numbers_of_the_sessions(tmp_path, rows):
     for row in rows:
         row |= {"seconds": 0.05, "decision_seconds": None if row["policy"] == "grid" else 0.02}
     tables = tables_of(write_sessions(tmp_path, rows, BUDGETS))
@@ -131,9 +124,7 @@ def test_tables_have_the_numbers_of_the_sessions(tmp_path: Path, rows: list[Row]
     ]
 
 
-def test_a_report_is_written_and_a_baseline_without_sessions_is_an_error(
-    tmp_path: Path, rows: list[Row]
-) -> None:
+def test_a_report_is_written_and_a_baseline_without_sessions_is_an_error(tmp_path, rows):
     write_sessions(tmp_path, rows, BUDGETS)
     done = run(report.main, str(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
@@ -148,9 +139,7 @@ def test_a_report_is_written_and_a_baseline_without_sessions_is_an_error(
 
 
 @pytest.mark.parametrize("kept", [0, 1, 4])
-def test_there_is_a_report_on_sessions_that_have_hardly_begun(
-    tmp_path: Path, rows: list[Row], kept: int
-) -> None:
+def test_there_is_a_report_on_sessions_that_have_hardly_begun(tmp_path, rows, kept):
     write_sessions(tmp_path, rows[:kept], BUDGETS)
     first, *others = sections_of(open_evaluation(tmp_path))
     there = [(line[0], line[1], *line[4:]) for line in first.tables[0].rows]

@@ -1,9 +1,6 @@
 """Sessions whose probes a policy chooses, as a user runs them."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +17,7 @@ SESSION += ("recording=mcap",)
 Found = tuple[Done, Recording, dict[str, Any]]
 
 
-def steered(logs: Path, *overrides: str) -> Found:
+def steered(logs, *overrides):
     done = run(probe.main, *SESSION, *overrides, f"logs={logs}", columns=120)
     assert done.returncode == 0, done.stderr
     (folder,) = (logs / "probe").iterdir()
@@ -28,18 +25,16 @@ def steered(logs: Path, *overrides: str) -> Found:
     return done, read_recording(folder / "recording.mcap"), summary
 
 
-def decided(recording: Recording) -> list[Decided]:
+def decided(recording):
     return [event for event in recording.events() if isinstance(event, Decided)]
 
 
 @pytest.fixture(scope="module")
-def informed(tmp_path_factory: pytest.TempPathFactory) -> Found:
+def informed(tmp_path_factory):
     return steered(tmp_path_factory.mktemp("logs"), "policy=information", "policy.probes=3")
 
 
-def test_every_probe_follows_a_decision_and_the_last_decision_says_why_it_ends(
-    informed: Found,
-) -> None:
+def test_every_probe_follows_a_decision_and_the_last_decision_says_why_it_ends(informed):
     done, recording, summary = informed
     decisions = decided(recording)
     assert [event.step for event in decisions] == [-1, 0, 1, 2]
@@ -59,13 +54,13 @@ def test_every_probe_follows_a_decision_and_the_last_decision_says_why_it_ends(
     assert recording.start.config["policy"]["name"] == "information"
 
 
-def test_registration_begins_with_the_first_contact(informed: Found) -> None:
+def test_registration_begins_with_the_first_contact(informed):
     probes = [event for event in informed[1].events() if isinstance(event, Probe)]
     touched = [made.step for made in probes if len(made.contacts)]
     assert informed[1].steps == tuple(range(touched[0], 3))
 
 
-def test_a_session_stops_when_the_plausible_poses_are_close_together(tmp_path: Path) -> None:
+def test_a_session_stops_when_the_plausible_poses_are_close_together(tmp_path):
     done, recording, _ = steered(tmp_path, "policy=information", "policy.stop.spread=0.1")
     last = decided(recording)[-1]
     assert last.decision.stop == "spread"
@@ -73,13 +68,11 @@ def test_a_session_stops_when_the_plausible_poses_are_close_together(tmp_path: P
     assert "policy.stop.spread" in done.stdout
 
 
-def test_a_surprise_starts_the_next_registration_afresh(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_surprise_starts_the_next_registration_afresh(tmp_path, monkeypatch):
     felt = Steering.felt
 
-    def surprised(steering: Steering, contacts: np.ndarray) -> bool:
-        return felt(steering, contacts) or steering.last.problem.key.step == 2  # type: ignore[union-attr]
+    def surprised(steering, contacts):
+        return felt(steering, contacts) or steering.last.problem.key.step == 2
 
     monkeypatch.setattr(Steering, "felt", surprised)
     _, recording, _ = steered(tmp_path, "policy=information", "policy.probes=4")
@@ -89,7 +82,7 @@ def test_a_surprise_starts_the_next_registration_afresh(
     assert len(recording.problem(3).initial_set) == 30
 
 
-def test_the_grid_is_not_recorded_as_a_policy(tmp_path: Path) -> None:
+def test_the_grid_is_not_recorded_as_a_policy(tmp_path):
     _, recording, _ = steered(tmp_path, "policy=grid", "session.start_contacts=99")
     assert decided(recording) == []
     assert "policy" not in recording.start.config
@@ -104,14 +97,14 @@ def test_the_grid_is_not_recorded_as_a_policy(tmp_path: Path) -> None:
         (("policy=information", "policy.actions.choice=sideways"), "accepted: configuration"),
     ],
 )
-def test_a_mistake_is_one_line(overrides: tuple[str, ...], message: str, tmp_path: Path) -> None:
+def test_a_mistake_is_one_line(overrides, message, tmp_path):
     done = run(probe.main, *SESSION, *overrides, f"logs={tmp_path}")
     assert done.returncode == 2
     assert message in done.stderr
     assert done.stderr.strip().count("\n") == 0
 
 
-def test_given_points_cannot_be_steered(tmp_path: Path) -> None:
+def test_given_points_cannot_be_steered(tmp_path):
     np.savez(tmp_path / "points.npz", surface=0.04 * np.eye(3))
     place = f"session.path={tmp_path / 'points.npz'}"
     done = run(probe.main, "session=points", place, "policy=information", f"logs={tmp_path}")

@@ -3,8 +3,6 @@
 Without --write: what differs from golden.json here. With it: make it anew, and say what changed.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys
@@ -17,17 +15,17 @@ import numpy as np
 import torch
 
 from replay.comparing.differences import ulps
-from tests.determinism.record import ENVIRONMENTS, Golden, recorded
+from tests.determinism.record import ENVIRONMENTS, recorded
 
 GOLDEN_FILE = Path(__file__).parents[1] / "determinism" / "golden.json"
 
 
-def read_golden() -> Golden:
+def read_golden():
     """The digests that every machine must give."""
     return json.loads(GOLDEN_FILE.read_text())["cases"]
 
 
-def write_golden(golden: Golden) -> None:
+def write_golden(golden):
     """One line a stage, so that a change of one shows as one."""
     cases = []
     for case, stages in golden.items():
@@ -37,19 +35,19 @@ def write_golden(golden: Golden) -> None:
     GOLDEN_FILE.write_text(head + ",\n".join(cases) + "\n }\n}\n")
 
 
-def versions() -> dict[str, str]:
+def versions():
     """Of the packages that could change a bit."""
     return {module.__name__: module.__version__ for module in (np, torch, numba, llvmlite)}
 
 
-def other_versions() -> str:
+def other_versions():
     """Which packages are not those with which golden.json was made; empty if all are."""
     made, here = json.loads(GOLDEN_FILE.read_text())["versions"], versions()
     other = (f"{name} {here[name]} for {made[name]}" for name in here if here[name] != made[name])
     return ", ".join(other)
 
 
-def differences(golden: Golden, record: Golden, *, whole: bool = True) -> list[str]:
+def differences(golden, record, *, whole=True):
     """A line for each case that is not as it should be, naming the first stage that differs.
 
     whole: all stages must be there, as they are where an observer keeps them, and not the results
@@ -71,14 +69,14 @@ def differences(golden: Golden, record: Golden, *, whole: bool = True) -> list[s
     return sorted(lines)
 
 
-def _apart(expected: list[str], found: list[str]) -> str:
+def _apart(expected, found):
     """How far the samples of a stage are from those in golden.json."""
     one, other = (np.array([float.fromhex(number) for number in row]) for row in (expected, found))
     apart = int(ulps(one, other).max())
     return f"by up to {apart} ulp in samples" if apart else "but not in samples"
 
 
-def main() -> None:
+def main():
     """Compare or write; status 1 where something differs."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", action="store_true", help="write golden.json")

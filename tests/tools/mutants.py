@@ -6,8 +6,6 @@ the tree, one at a time, and the tests of the room are run on each, golden diges
 replays left out. Kernels are compiled again, as their code is kept by what is in the files.
 """
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import os
@@ -17,7 +15,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 from cosmic_ray.ast import ast_nodes, get_ast
@@ -56,7 +53,7 @@ OPERATORS = [
 Mutant = tuple[Path, str, int]  # file, operator, its occurrence
 
 
-def mutants_of(file: Path) -> Iterator[Mutant]:
+def mutants_of(file):
     """Every mutant of a file."""
     nodes = list(ast_nodes(get_ast((ROOT / file).read_text())))
     for operator in OPERATORS:
@@ -65,7 +62,7 @@ def mutants_of(file: Path) -> Iterator[Mutant]:
         yield from ((file, operator, occurrence) for occurrence in range(count))
 
 
-def tests_of(room: Path) -> list[str]:
+def tests_of(room):
     """The tests of a room: its folder of `tests`, or the file there that is named after it."""
     folder = ROOT / "tests" / room
     if folder.is_dir():
@@ -74,7 +71,7 @@ def tests_of(room: Path) -> list[str]:
     return [str(file.relative_to(ROOT)) for file in named]
 
 
-def copied_to(folder: Path) -> None:
+def copied_to(folder):
     """Copy all files that git knows of, or would take."""
     listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     names = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True).stdout
@@ -84,7 +81,7 @@ def copied_to(folder: Path) -> None:
             shutil.copy2(ROOT / name, folder / name)
 
 
-def passes(folder: Path, tests: list[str], seconds: float | None = None) -> bool:
+def passes(folder, tests, seconds=None):
     """Whether all tests pass in a copy; one that takes longer has noticed something."""
     command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", *tests]
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
@@ -97,7 +94,7 @@ def passes(folder: Path, tests: list[str], seconds: float | None = None) -> bool
     return done.returncode == 0
 
 
-def main() -> int:
+def main():
     """Make the mutants, run the tests, and show those that nothing noticed."""
     parser = argparse.ArgumentParser(prog="python -m tests.tools.mutants", description=__doc__)
     parser.add_argument("room", type=Path, help="such as chsel/next_probe")

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
 
 from chsel.methods.anchor_sampling import most_informative_first
 from chsel.methods.anchored.energy import Energy
-from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.noise import NoiseModel
 from chsel.problem.online_registration import pose_problem
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, product
 from chsel.problem.registration_problem import (
     ArchiveSnapshot,
-    Hypotheses,
     NullObserver,
     RegistrationProblem,
 )
@@ -31,7 +28,7 @@ WORKSPACE = Workspace((-0.1, -0.2, 0.0), (0.5, 0.4, 0.6))
 SIDE = 0.025  # of free voxels, metres
 
 
-def l_shape() -> trimesh.Trimesh:
+def l_shape():
     """A body without symmetry."""
     arms = ([0.2, 0.06, 0.05], [0.06, 0.14, 0.05], [0.06, 0.06, 0.1])
     parts = [trimesh.creation.box(bounds=np.array([[0.0, 0.0, 0.0], arm])) for arm in arms]
@@ -45,12 +42,12 @@ BOX = trimesh.creation.box(BOX_SIDES)
 BOX_GRID = SdfGrid.from_mesh(BOX, 0.01)
 
 
-def contacts_on(mesh: trimesh.Trimesh, count: int) -> FloatArray:
+def contacts_on(mesh, count):
     """Points (count, 3) all over a body at TRUTH."""
     return apply(TRUTH, np.asarray(trimesh.sample.sample_surface(mesh, count, seed=1)[0]))
 
 
-def on_faces(count: int, height: FloatArray | float = 0.0) -> FloatArray:
+def on_faces(count, height=0.0):
     """Points (count, 3) over the middles of the faces of BOX in turn, in its frame.
 
     height: above the surface, metres. Nearby, distances change as those from planes.
@@ -62,17 +59,17 @@ def on_faces(count: int, height: FloatArray | float = 0.0) -> FloatArray:
     return points
 
 
-def box_problem(points: KnownPoints) -> RegistrationProblem:
+def box_problem(points):
     """Points of BOX, whatever its pose."""
     return RegistrationProblem(BOX_GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
 
 
-def energy_of(points: KnownPoints, noise: NoiseModel) -> Energy:
+def energy_of(points, noise):
     """The energy of poses of BOX."""
     return Energy(box_problem(points), most_informative_first(points), noise)
 
 
-def poses_around_truth(count: int, shift: float, turn: float) -> Poses:
+def poses_around_truth(count, shift, turn):
     """Poses turned by an angle, radians, and shifted in any direction by a length, metres."""
     random = np.random.default_rng(count)
     axes, ways = random.standard_normal((2, count, 3))
@@ -81,7 +78,7 @@ def poses_around_truth(count: int, shift: float, turn: float) -> Poses:
     return Poses.of(inverse(TRUTH @ compose(axis_angle(axes, turn), ways)))
 
 
-def known_points(world_from_object: FloatArray, contacts: int) -> KnownPoints:
+def known_points(world_from_object, contacts):
     """Contacts with the L, and the free voxels of the workspace that miss it."""
     surface = trimesh.sample.sample_surface(MESH, contacts, seed=1)[0]
     lower, upper = WORKSPACE.bounds
@@ -116,20 +113,14 @@ ODD = {
 """Points that tell little, or are hardly those of an object."""
 
 
-def posed(
-    method: Method,
-    points: KnownPoints = POINTS,
-    previous: Hypotheses | None = None,
-    sdf: SdfGrid = GRID,
-    **changes: Any,
-) -> RegistrationProblem:
+def posed(method, points=POINTS, previous=None, sdf=GRID, **changes):
     """The problem that a method is given, with other fields as said."""
     key = StreamKey(3, 1)
     problem = pose_problem(sdf, points, WORKSPACE, SIDE, key, method.online, previous)
     return replace(problem, **changes)
 
 
-def around_truth(count: int = 8, angle: float = 0.3, shift: float = 0.03) -> FloatArray:
+def around_truth(count=8, angle=0.3, shift=0.03):
     """E_0 (count, 4, 4), turned by an angle and shifted at random."""
     random = np.random.default_rng(3)
     axis = random.standard_normal((count, 3))
@@ -153,25 +144,25 @@ class Watcher(NullObserver):
 
     snapshot_interval: int = 0
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         self.traces: list[Trace] = []
         self.progressed: list[tuple[str, int, int]] = []  # stage, iteration, total
         self.archives: list[ArchiveSnapshot] = []
 
     @property
-    def iterations(self) -> list[int]:
+    def iterations(self):
         """Those that were traced."""
         return [trace.iteration for trace in self.traces]
 
-    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+    def trace(self, stage, iteration, vectors, cost):
         """Keep copies."""
         self.traces.append(Trace(stage, iteration, vectors.copy(), cost.copy()))
         vectors[:], cost[:] = np.nan, np.nan
 
-    def progress(self, stage: str, iteration: int, total: int) -> None:
+    def progress(self, stage, iteration, total):
         """Keep the numbers."""
         self.progressed.append((stage, iteration, total))
 
-    def snapshot(self, archive: ArchiveSnapshot) -> None:
+    def snapshot(self, archive):
         """Keep it."""
         self.archives.append(archive)

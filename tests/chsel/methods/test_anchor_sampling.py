@@ -1,15 +1,10 @@
 """Poses that put surface points onto contacts, and the best of many."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 
 from chsel.methods.anchor_kernels import NO_POSE, UNIT, Box32, CoarseScore, keep_best
 from chsel.methods.anchor_sampling import AnchorSampler, AnchorSettings, most_informative_first
-from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, axis_angle, compose, random_rotations, rotated
@@ -23,15 +18,7 @@ PAIRS, SINGLES = AnchorSettings(1.0, 0.0), AnchorSettings(0.0, 1.0)
 UNIFORM = AnchorSettings(0.0, 0.0)
 
 
-def drawn(
-    points: KnownPoints,
-    settings: AnchorSettings,
-    samples: int = 3000,
-    most: int = 3000,
-    plane: PlaneSettings | None = None,
-    index: int = 0,
-    left_out: int = 0,
-) -> FloatArray:
+def drawn(points, settings, samples=3000, most=3000, plane=None, index=0, left_out=0):
     """The best poses (K, 12); all of them where most is as many."""
     problem = RegistrationProblem(
         BOX_GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2)
@@ -41,7 +28,7 @@ def drawn(
     return sampler.best(samples, most, index=index, left_out=left_out).numbers
 
 
-def distances(poses: FloatArray, points: FloatArray, lookup: str = "trilinear") -> FloatArray:
+def distances(poses, points, lookup="trilinear"):
     """Signed distances (B, M) at world points."""
     rotations = poses[:, :9].reshape(-1, 3, 3)
     moved = np.einsum("nij,mj->nmi", rotations, points) + poses[:, None, 9:]
@@ -49,7 +36,7 @@ def distances(poses: FloatArray, points: FloatArray, lookup: str = "trilinear") 
     return s.reshape(len(poses), len(points))
 
 
-def test_pairs_put_the_surface_onto_two_contacts() -> None:
+def test_pairs_put_the_surface_onto_two_contacts():
     contacts = CONTACTS[[0, 1]]
     poses = drawn(KnownPoints(known=contacts), PAIRS)
     assert len(poses) > 300
@@ -60,20 +47,20 @@ def test_pairs_put_the_surface_onto_two_contacts() -> None:
     assert np.median(uniform) > 0.03
 
 
-def test_one_contact_is_met_by_every_pose_that_is_anchored_on_it() -> None:
+def test_one_contact_is_met_by_every_pose_that_is_anchored_on_it():
     poses = drawn(KnownPoints(known=CONTACTS[:1]), SINGLES)
     assert len(poses) > 300
     assert np.abs(distances(poses, CONTACTS[:1])).max() < 0.003
 
 
 @pytest.mark.parametrize("value", [0.02, -0.01])
-def test_a_point_of_known_distance_is_met_at_that_distance(value: float) -> None:
+def test_a_point_of_known_distance_is_met_at_that_distance(value):
     poses = drawn(KnownPoints(known=CONTACTS[:1], known_sdf=np.array([value])), SINGLES)
     off = np.abs(distances(poses, CONTACTS[:1]) - value)
     assert np.quantile(off, 0.8) < 0.003
 
 
-def test_rotations_are_rigid_and_objects_within_bounds() -> None:
+def test_rotations_are_rigid_and_objects_within_bounds():
     points = KnownPoints(known=CONTACTS)
     problem = RegistrationProblem(
         BOX_GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2)
@@ -89,7 +76,7 @@ def test_rotations_are_rigid_and_objects_within_bounds() -> None:
     assert ((origins >= lower) & (origins <= upper)).all()
 
 
-def test_the_best_are_the_first_of_all_and_do_not_depend_on_threads() -> None:
+def test_the_best_are_the_first_of_all_and_do_not_depend_on_threads():
     free = np.random.default_rng(0).uniform(-0.1, 0.5, (3000, 3))
     points = KnownPoints(free=free, known=CONTACTS)
     count = 70_000  # more than are drawn at once
@@ -103,14 +90,14 @@ def test_the_best_are_the_first_of_all_and_do_not_depend_on_threads() -> None:
     assert np.abs(drawn(points, AnchorSettings(), count, 40, index=1) - one).max() > 1e-3
 
 
-def test_the_best_fit_better_than_the_others() -> None:
+def test_the_best_fit_better_than_the_others():
     poses = drawn(KnownPoints(known=CONTACTS), AnchorSettings(), 6000, 6000)
     fits = np.abs(distances(poses, CONTACTS)).mean(axis=1)
     assert fits[:20].max() < np.median(fits)
     assert fits[:20].mean() < 0.5 * fits.mean()
 
 
-def test_on_a_plane_poses_stand_on_it_and_still_meet_contacts() -> None:
+def test_on_a_plane_poses_stand_on_it_and_still_meet_contacts():
     turn = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5))
     standing = compose(turn, np.array([0.2, 0.1, 0.3]))
     contact = apply(standing, np.array([[0.1, 0.02, 0.01]]))
@@ -122,7 +109,7 @@ def test_on_a_plane_poses_stand_on_it_and_still_meet_contacts() -> None:
     assert np.abs(distances(poses, contact)).max() < 0.006
 
 
-def test_known_points_come_far_apart_first_and_none_is_lost() -> None:
+def test_known_points_come_far_apart_first_and_none_is_lost():
     random = np.random.default_rng(2)
     known, values = random.standard_normal((200, 3)), random.standard_normal(200)
     ordered = most_informative_first(KnownPoints(known=known, known_sdf=values))
@@ -134,7 +121,7 @@ def test_known_points_come_far_apart_first_and_none_is_lost() -> None:
     assert gaps.min() > 2.0
 
 
-def test_poses_come_in_the_order_of_their_plain_scores() -> None:
+def test_poses_come_in_the_order_of_their_plain_scores():
     """Mean distance of contacts up to 60 mm, and depths of nodes inside that are in free voxels."""
     lattice = np.stack(np.meshgrid(*[np.arange(-0.1, 0.7, 0.03)] * 3, indexing="ij"), -1)
     free = lattice.reshape(-1, 3)
@@ -155,7 +142,7 @@ def test_poses_come_in_the_order_of_their_plain_scores() -> None:
 
 
 @pytest.mark.parametrize("left_out", [0, 1])
-def test_kept_are_the_lowest_scores(left_out: int) -> None:
+def test_kept_are_the_lowest_scores(left_out):
     random = np.random.default_rng(0)
     count, most = 3000, 30
     grid, voxels = box((6, 5, 4), 20.0), box((4, 6, 5), 10.0)
@@ -199,23 +186,23 @@ def test_kept_are_the_lowest_scores(left_out: int) -> None:
     np.testing.assert_array_equal(np.sort(heap), np.sort(keys[is_in])[:most])
 
 
-def box(shape: tuple[int, int, int], inverse: float) -> Box32:
+def box(shape, inverse):
     """A grid that begins at 0.05 m."""
     first, most = (np.float32(0.05),) * 3, tuple(np.float32(n - 1) for n in shape)
     across, along = np.int32(shape[1] * shape[2]), np.int32(shape[2])
     return Box32(first, np.float32(inverse), most, across, along)
 
 
-def single(random: np.random.Generator, low: float, high: float, *shape: int) -> Any:
+def single(random, low, high, *shape):
     return random.uniform(low, high, shape).astype(np.float32)
 
 
-def nodes(grid: Box32, steps: Any) -> Any:
+def nodes(grid, steps):
     x, y, z = np.moveaxis((steps + np.float32(0.5)).astype(np.int64), -1, 0)
     return x * grid.across + y * grid.along + z
 
 
-def test_the_worst_contact_can_be_left_out() -> None:
+def test_the_worst_contact_can_be_left_out():
     """One of six contacts is 80 mm off: the poses come in the order of what the others cost."""
     contacts = CONTACTS[:6] + np.array([[0.0, 0.0, 0.08]] + [[0.0, 0.0, 0.0]] * 5)
     points = KnownPoints(known=contacts)

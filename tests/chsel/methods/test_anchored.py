@@ -1,9 +1,6 @@
 """The contact-anchored search: what it finds, and that odd problems have results."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,10 +18,7 @@ from chsel.problem.outline import outline_distances_to
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, axis_angle, check_rigid, compose, inverse
 from chsel.problem.registration_problem import (
-    Hypotheses,
     NullObserver,
-    Observer,
-    RegistrationProblem,
 )
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import PlaneSettings, search_space
@@ -54,13 +48,11 @@ INEXACT = replace(  # by 2 mm
 INEXACT_FEW = replace(INEXACT, known=INEXACT.known[:3], known_sdf=None)
 
 
-def anchored(effort: Effort = EFFORT, **changes: Any) -> Anchored:
+def anchored(effort=EFFORT, **changes):
     return Anchored(AnchoredSettings(effort=effort, **changes))
 
 
-def registered(
-    method: Anchored, problem: RegistrationProblem, observer: Observer | None = None
-) -> Hypotheses:
+def registered(method, problem, observer=None):
     """The result, found to be whole: as many rigid poses as E_0 has, with their energies."""
     search = Search(problem, method.settings, observer or NullObserver())
     found = search.hypotheses(search.spread(search.minima()))
@@ -79,20 +71,20 @@ def registered(
     return found
 
 
-def assert_found(found: Hypotheses) -> None:
+def assert_found(found):
     position, rotation = pose_errors(found.object_from_world[:1], TRUTH, ObjectSymmetry())
     assert position[0] < 0.005
     assert rotation[0] < 0.05
 
 
-def test_the_object_is_found_where_it_was_touched() -> None:
+def test_the_object_is_found_where_it_was_touched():
     method = anchored()
     found = registered(method, posed(method))
     assert_found(found)
     assert found.distinct == 30
 
 
-def test_results_depend_on_the_seed_and_every_stage_is_reported() -> None:
+def test_results_depend_on_the_seed_and_every_stage_is_reported():
     method, watcher = anchored(), Watcher()
     first = method.register(posed(method), watcher)
     stages = [stage for stage, _, _ in watcher.progressed]
@@ -102,12 +94,12 @@ def test_results_depend_on_the_seed_and_every_stage_is_reported() -> None:
 
 
 @pytest.mark.parametrize("name", ODD)
-def test_odd_points_have_results(name: str) -> None:
+def test_odd_points_have_results(name):
     method = anchored()
     registered(method, posed(method, ODD[name]))
 
 
-def test_few_contacts_leave_many_distinct_poses() -> None:
+def test_few_contacts_leave_many_distinct_poses():
     method = anchored()
     found = registered(method, posed(method, FEW))
     assert found.distinct == 30
@@ -116,7 +108,7 @@ def test_few_contacts_leave_many_distinct_poses() -> None:
 
 
 @pytest.mark.parametrize("points", [FEW, INEXACT], ids=["few", "inexact"])
-def test_candidates_are_below_the_limit_and_costs_the_plain_formula(points: KnownPoints) -> None:
+def test_candidates_are_below_the_limit_and_costs_the_plain_formula(points):
     method = anchored(limit=4.0)
     problem = posed(method, points)
     search = Search(problem, method.settings, NullObserver())
@@ -131,7 +123,7 @@ def test_candidates_are_below_the_limit_and_costs_the_plain_formula(points: Know
     np.testing.assert_allclose(found.cost[::3], expected, atol=0.01 * len(points.known))
 
 
-def test_the_archive_leads_on_to_the_next_step() -> None:
+def test_the_archive_leads_on_to_the_next_step():
     method = anchored()
     first = method.register(posed(method, FEW))
     assert first.archive is not None
@@ -144,7 +136,7 @@ def test_the_archive_leads_on_to_the_next_step() -> None:
     assert method.register(again).cost[0] <= first.cost[0] + 1e-12
 
 
-def test_a_good_pose_of_the_last_step_is_not_lost() -> None:
+def test_a_good_pose_of_the_last_step_is_not_lost():
     """Even if hardly any samples are drawn."""
     method = anchored(replace(EFFORT, samples=10))
     problem = posed(method, low_cost_set=inverse(TRUTH)[None])
@@ -152,7 +144,7 @@ def test_a_good_pose_of_the_last_step_is_not_lost() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 700])
-def test_as_many_hypotheses_come_as_are_wanted(count: int) -> None:
+def test_as_many_hypotheses_come_as_are_wanted(count):
     method = anchored()
     problem = posed(method, FEW)
     initial = np.resize(problem.initial_set, (count, 4, 4))
@@ -160,7 +152,7 @@ def test_as_many_hypotheses_come_as_are_wanted(count: int) -> None:
     assert found.distinct == count
 
 
-def test_on_a_plane_starts_off_it_count_by_where_they_stand() -> None:
+def test_on_a_plane_starts_off_it_count_by_where_they_stand():
     """One that fits where the object cannot be does not keep those out that fit on the plane."""
     method = anchored(plane=PlaneSettings(plane_height=0.2))
     problem = posed(method, initial_set=np.tile(inverse(TRUTH), (5, 1, 1)))
@@ -168,13 +160,13 @@ def test_on_a_plane_starts_off_it_count_by_where_they_stand() -> None:
     np.testing.assert_allclose(inverse(found.elites)[:, 2, 3], 0.2, atol=1e-3)
 
 
-def rounds_of(method: Anchored, problem: RegistrationProblem) -> int:
+def rounds_of(method, problem):
     watcher = Watcher()
     method.register(problem, watcher)
     return [stage for stage, _, _ in watcher.progressed].count("search")
 
 
-def test_rounds_go_on_while_there_are_new_modes_and_stop_at_the_budget() -> None:
+def test_rounds_go_on_while_there_are_new_modes_and_stop_at_the_budget():
     one = EFFORT.samples + 24 * 5 + 12 * 8 + 8 * 30
     for points, budget, rounds in (
         (POINTS, 0, 1),
@@ -186,7 +178,7 @@ def test_rounds_go_on_while_there_are_new_modes_and_stop_at_the_budget() -> None
 
 
 @pytest.mark.parametrize(("contacts", "spacing"), [(12, 5000), (40, 60)])
-def test_wrong_free_points_do_not_move_the_best(contacts: int, spacing: int) -> None:
+def test_wrong_free_points_do_not_move_the_best(contacts, spacing):
     """1 or 77 voxels that a sensor took for free, up to half a voxel inside of the object."""
     inner = np.stack(np.meshgrid(*[np.arange(-0.05, 0.3, 0.005)] * 3, indexing="ij"), -1)
     inner = inner.reshape(-1, 3)
@@ -202,7 +194,7 @@ def test_wrong_free_points_do_not_move_the_best(contacts: int, spacing: int) -> 
 
 
 @pytest.mark.parametrize("contacts", [4, 6, 9])
-def test_the_truth_stays_beside_a_foreign_contact_among_few(contacts: int) -> None:
+def test_the_truth_stays_beside_a_foreign_contact_among_few(contacts):
     """Among the hypotheses, or the rivals of the best, which is not determined if it is wrong."""
     method, points = Anchored(AnchoredSettings()), known_points(TRUTH, contacts)
     foreign = apply(TRUTH, np.array([[0.03, 0.03, 0.16]]))
@@ -218,12 +210,10 @@ def test_the_truth_stays_beside_a_foreign_contact_among_few(contacts: int) -> No
 
 
 @pytest.mark.parametrize(("contacts", "expected"), [(3, {0}), (4, {0, 1})])
-def test_rounds_of_more_than_three_contacts_leave_one_out_in_turn(
-    monkeypatch: pytest.MonkeyPatch, contacts: int, expected: set[int]
-) -> None:
+def test_rounds_of_more_than_three_contacts_leave_one_out_in_turn(monkeypatch, contacts, expected):
     left_out, best = set(), AnchorSampler.best
 
-    def watched(*arguments: Any, **named: Any) -> Poses:
+    def watched(*arguments, **named):
         left_out.add(named["left_out"])
         return best(*arguments, **named)
 
@@ -233,7 +223,7 @@ def test_rounds_of_more_than_three_contacts_leave_one_out_in_turn(
     assert left_out == expected
 
 
-def test_the_twin_of_a_nearly_symmetric_object_is_found_from_the_other() -> None:
+def test_the_twin_of_a_nearly_symmetric_object_is_found_from_the_other():
     """Contacts lie half way between a box and the same box turned; one pose is sampled."""
     sdf = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.106, 0.16)), 0.005)
     between = trimesh.creation.box((0.103, 0.103, 0.16))
@@ -253,7 +243,7 @@ def test_the_twin_of_a_nearly_symmetric_object_is_found_from_the_other() -> None
     assert str(trust).startswith("determined up to a turn of ")
 
 
-def test_poses_are_held_that_errors_shared_by_all_points_explain() -> None:
+def test_poses_are_held_that_errors_shared_by_all_points_explain():
     """All points are 3.5 mm beside where they were, as by a wrong calibration."""
     shift = np.array([0.0, 0.0, 0.0035])
     points = KnownPoints(known=POINTS.known + shift, free=POINTS.free + shift)
@@ -266,7 +256,7 @@ def test_poses_are_held_that_errors_shared_by_all_points_explain() -> None:
         assert flags.tolist() == [holds, False]
 
 
-def test_a_foreign_contact_does_not_move_the_best() -> None:
+def test_a_foreign_contact_does_not_move_the_best():
     foreign = POINTS.known[20:22] + np.array([0.0, 0.0, 0.4])
     points = KnownPoints(free=POINTS.free, known=np.concatenate([POINTS.known[:20], foreign]))
     method = anchored()
@@ -280,7 +270,7 @@ def test_a_foreign_contact_does_not_move_the_best() -> None:
     assert flags.tolist() == [True, True, False]
 
 
-def test_updates_on_the_same_points_never_lose_the_best() -> None:
+def test_updates_on_the_same_points_never_lose_the_best():
     """With a sensor as inexact as the points, so that all energies are of one noise."""
     method, previous, lowest = anchored(noise=0.003), None, []
     for _ in range(5):
@@ -289,12 +279,12 @@ def test_updates_on_the_same_points_never_lose_the_best() -> None:
     assert (np.diff(lowest) <= 1e-12).all()
 
 
-def test_a_limit_that_excludes_nearly_all_still_gives_hypotheses() -> None:
+def test_a_limit_that_excludes_nearly_all_still_gives_hypotheses():
     method = anchored(limit=1e-9)
     registered(method, posed(method))
 
 
-def test_an_object_of_few_nodes_inside_has_results() -> None:
+def test_an_object_of_few_nodes_inside_has_results():
     plate = trimesh.creation.box((0.1, 0.08, 0.011))
     method, grid = anchored(), SdfGrid.from_mesh(plate, 0.01)
     contacts = apply(TRUTH, np.asarray(trimesh.sample.sample_surface(plate, 5, seed=1)[0]))
@@ -302,7 +292,7 @@ def test_an_object_of_few_nodes_inside_has_results() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:no node of the SDF:UserWarning")
-def test_a_grid_without_a_node_inside_is_one_clear_error() -> None:
+def test_a_grid_without_a_node_inside_is_one_clear_error():
     grid = SdfGrid(GRID.origin, 0.01, np.maximum(GRID.values, 0.001), GRID.gradients)
     method = anchored()
     with pytest.raises(ChselError, match="no node of the SDF grid is inside") as raised:
@@ -310,13 +300,13 @@ def test_a_grid_without_a_node_inside_is_one_clear_error() -> None:
     assert "\n" not in str(raised.value)
 
 
-def test_a_point_far_away_costs_no_more_than_any_that_is_off() -> None:
+def test_a_point_far_away_costs_no_more_than_any_that_is_off():
     method = anchored()
     known = np.concatenate([[[1000.0, 0.0, 0.0]], POINTS.known])
     assert_found(registered(method, posed(method, KnownPoints(free=POINTS.free, known=known))))
 
 
-def test_hypotheses_are_chosen_for_the_least_expected_plausible_diversity() -> None:
+def test_hypotheses_are_chosen_for_the_least_expected_plausible_diversity():
     count = 6
     problem = posed(anchored(), INEXACT_FEW, initial_set=np.tile(inverse(TRUTH), (count, 1, 1)))
     search = Search(problem, AnchoredSettings(effort=EFFORT), NullObserver())
@@ -326,7 +316,7 @@ def test_hypotheses_are_chosen_for_the_least_expected_plausible_diversity() -> N
     descriptors = surface_descriptors(problem.sdf, candidates.poses)
     apart = ((descriptors[:, None] - descriptors) ** 2).sum(axis=2)
 
-    def expected_diversity(chosen: list[int]) -> float:
+    def expected_diversity(chosen):
         """Of hypotheses, over all candidates that may be the true pose."""
         total = 0.0
         for truth in energies:

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +8,6 @@ from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
 from chsel.methods import build_method, preset_settings
 from chsel.methods.anchor_sampling import AnchoredStarts, anchored_starts
 from chsel.methods.chsel import Chsel
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.streams import StreamKey
@@ -25,7 +22,7 @@ FAR = inverse(compose(np.tile(np.eye(3), (5, 1, 1)), np.full((5, 3), 0.05)))
 STARTS = AnchoredStarts(samples=3000, kept=8)
 
 
-def posed(points: KnownPoints | None = None, sdf: SdfGrid = GRID) -> RegistrationProblem:
+def posed(points=None, sdf=GRID):
     """A box touched on all sides, of which E_0 (5, 4, 4) knows nothing."""
     if points is None:
         surface = trimesh.sample.sample_surface(BOX, 40, seed=1)[0]
@@ -33,14 +30,12 @@ def posed(points: KnownPoints | None = None, sdf: SdfGrid = GRID) -> Registratio
     return RegistrationProblem(sdf, points, FAR, WORKSPACE, 0.05, StreamKey(3, 2))
 
 
-def starts_of(
-    problem: RegistrationProblem, index: int = 0, plane: PlaneSettings | None = None
-) -> FloatArray:
+def starts_of(problem, index=0, plane=None):
     space = search_space(plane, problem.sdf)
     return anchored_starts(problem, space, STARTS, index).matrices
 
 
-def test_starts_are_nearer_to_the_contacts_than_e_0() -> None:
+def test_starts_are_nearer_to_the_contacts_than_e_0():
     problem = posed()
     starts = starts_of(problem)
     assert starts.shape == (8, 4, 4)
@@ -52,13 +47,13 @@ def test_starts_are_nearer_to_the_contacts_than_e_0() -> None:
     assert min(before) > 0.2
 
 
-def test_starts_on_a_plane_stand_on_it() -> None:
+def test_starts_on_a_plane_stand_on_it():
     world = inverse(starts_of(posed(), plane=PlaneSettings(plane_height=0.3)))
     np.testing.assert_allclose(world[:, 2, 2], 1.0, atol=1e-12)
     assert np.ptp(world[:, 2, 3]) < 1e-12
 
 
-def test_without_contacts_starts_are_anywhere_in_the_workspace() -> None:
+def test_without_contacts_starts_are_anywhere_in_the_workspace():
     free = np.stack(np.meshgrid(*[np.arange(0.025, 0.2, 0.05)] * 3), axis=-1).reshape(-1, 3)
     position = inverse(starts_of(posed(KnownPoints(free=free))))[:, :3, 3]
     assert (position > -0.15).all()
@@ -66,7 +61,7 @@ def test_without_contacts_starts_are_anywhere_in_the_workspace() -> None:
     assert position.std(axis=0).min() > 0.1
 
 
-def test_there_are_none_of_an_object_without_a_surface() -> None:
+def test_there_are_none_of_an_object_without_a_surface():
     thin = SdfGrid(GRID.origin, GRID.resolution, np.abs(GRID.values) + 0.01, GRID.gradients)
     assert has_surface(GRID)
     assert not has_surface(thin)
@@ -75,7 +70,7 @@ def test_there_are_none_of_an_object_without_a_surface() -> None:
 
 
 @pytest.mark.parametrize("name", ["chsel", "chsel_cma_me"])
-def test_default_finds_what_e_0_is_too_far_from(name: str) -> None:
+def test_default_finds_what_e_0_is_too_far_from(name):
     settings = preset_settings(name)
     assert settings.starts is not None
     quick = replace(settings, emitter=replace(settings.emitter, iterations=5))

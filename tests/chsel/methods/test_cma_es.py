@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -14,12 +13,10 @@ import pytest
 from chsel.methods import medial_constraint
 from chsel.methods.medial_constraint import (
     CmaEsSettings,
-    Run,
     evolved,
     run_all,
 )
-from chsel.numerics.arrays import FloatArray
-from chsel.problem.registration_problem import NullObserver, Observer
+from chsel.problem.registration_problem import NullObserver
 from chsel.problem.streams import StreamKey
 from tests.chsel.methods.scene import Watcher
 
@@ -33,7 +30,7 @@ class Landscape(NamedTuple):
 
 
 @numba.njit
-def cost_of(model, space, vector, work):  # type: ignore[no-untyped-def]
+def cost_of(model, space, vector, work):
     total, size = 0.0, len(vector)
     if model.kind == ROSENBROCK:
         for j in range(size - 1):
@@ -48,13 +45,13 @@ def cost_of(model, space, vector, work):  # type: ignore[no-untyped-def]
 
 
 @numba.njit
-def costs_of(model, space, vectors, costs, work):  # type: ignore[no-untyped-def]
+def costs_of(model, space, vectors, costs, work):
     for n in range(len(vectors)):
         costs[n] = cost_of(model, space, vectors[n], work)
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _on_landscapes() -> Iterator[None]:
+def _on_landscapes():
     """Compiles the runs, as they are, around other functions instead of the cost."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(medial_constraint, "costs_of", costs_of)
@@ -63,11 +60,11 @@ def _on_landscapes() -> Iterator[None]:
         yield
 
 
-def objective(kind: int) -> Any:
+def objective(kind):
     """What the runs ask of an objective."""
     landscape = Landscape(kind)
 
-    def costs(vectors: FloatArray) -> FloatArray:
+    def costs(vectors):
         return np.array([cost_of(landscape, 0, vector, 0) for vector in vectors])
 
     space = SimpleNamespace(encode=lambda starts: starts)
@@ -76,9 +73,7 @@ def objective(kind: int) -> Any:
     )
 
 
-def runs_on(
-    kind: int, settings: CmaEsSettings, starts: FloatArray, observer: Observer | None = None
-) -> list[Run]:
+def runs_on(kind, settings, starts, observer=None):
     key, observer = StreamKey(0, 0), observer or NullObserver()
     return run_all(objective(kind), starts, settings, key, observer)
 
@@ -90,8 +85,8 @@ def runs_on(
     [(SPHERE, 1.0, 0.5, 1320), (ELLIPSOID, 1.0, 0.5, 4800), (ROSENBROCK, 0.0, 0.1, 4930)],
 )
 def test_it_needs_about_as_many_evaluations_as_the_cma_package(
-    kind: int, start: float, sigma0: float, theirs: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    kind, start, sigma0, theirs, monkeypatch
+):
     monkeypatch.setattr(medial_constraint, "_BLOCK", 1)  # traces every generation
     settings, watcher = replace(UNENDING, sigma0=sigma0, generations=900), Watcher()
     runs = runs_on(kind, settings, np.full((21, D), start), watcher)
@@ -101,7 +96,7 @@ def test_it_needs_about_as_many_evaluations_as_the_cma_package(
     assert 0.8 * theirs < np.median(evaluations) < 1.25 * theirs
 
 
-def test_the_best_is_the_lowest_cost_met_and_the_start_counts() -> None:
+def test_the_best_is_the_lowest_cost_met_and_the_start_counts():
     lowest = []
     for generations in range(1, 31):
         (run,) = runs_on(SPHERE, replace(UNENDING, generations=generations), np.ones((1, D)))
@@ -113,7 +108,7 @@ def test_the_best_is_the_lowest_cost_met_and_the_start_counts() -> None:
     assert run.cost[0] == 0.0
 
 
-def test_every_start_draws_from_a_stream_of_its_own() -> None:
+def test_every_start_draws_from_a_stream_of_its_own():
     settings, starts = replace(UNENDING, generations=120), np.tile(np.ones(D), (3, 1))
     three = runs_on(SPHERE, settings, starts)
     alone = runs_on(SPHERE, settings, starts[:1])
@@ -121,13 +116,13 @@ def test_every_start_draws_from_a_stream_of_its_own() -> None:
     assert len({tuple(run.best) for run in three}) == 3
 
 
-def ended_at(kind: int, **changes: Any) -> tuple[int, Run]:
+def ended_at(kind, **changes):
     (run,) = runs_on(kind, replace(UNENDING, **changes), np.ones((1, D)))
     return int(run.generations[0]), run
 
 
-def test_tolfun_ends_a_run_when_no_cost_of_a_generation_is_far_above_the_lowest() -> None:
-    def spread(run: Run) -> float:
+def test_tolfun_ends_a_run_when_no_cost_of_a_generation_is_far_above_the_lowest():
+    def spread(run):
         return float(run.batch.objectives.max() - run.cost[0])
 
     count, run = ended_at(SPHERE, tolfun=1e-5)
@@ -140,20 +135,20 @@ def test_tolfun_ends_a_run_when_no_cost_of_a_generation_is_far_above_the_lowest(
     assert later > count
 
 
-def test_generations_end_a_run_and_none_at_all_leaves_the_start() -> None:
+def test_generations_end_a_run_and_none_at_all_leaves_the_start():
     assert ended_at(ROSENBROCK, generations=17)[0] == 17
     (run,) = runs_on(SPHERE, replace(UNENDING, generations=0), np.ones((1, D)))
     np.testing.assert_array_equal(run.best, 1.0)
 
 
 @pytest.mark.parametrize("kind", [FLAT, NOT_FINITE])
-def test_costs_that_are_all_the_same_end_a_run_at_once_at_its_start(kind: int) -> None:
+def test_costs_that_are_all_the_same_end_a_run_at_once_at_its_start(kind):
     count, run = ended_at(kind)
     assert count == 1
     np.testing.assert_array_equal(run.best, 1.0)
 
 
-def test_populations_and_generations_are_those_of_pycma() -> None:
+def test_populations_and_generations_are_those_of_pycma():
     assert CmaEsSettings().size(9, 30) == 10
     assert CmaEsSettings().size(3, 30) == 7
     single = CmaEsSettings(starts="single")
@@ -161,7 +156,7 @@ def test_populations_and_generations_are_those_of_pycma() -> None:
     assert single.most_generations(9, 30) == 4043
 
 
-def test_a_single_run_gives_samples_of_its_last_distribution() -> None:
+def test_a_single_run_gives_samples_of_its_last_distribution():
     settings = CmaEsSettings(starts="single", tolfun=1e-5)
     starts = np.concatenate([np.ones((1, D)), np.full((29, D), 50.0)])
     found = evolved(objective(SPHERE), starts, settings, StreamKey(0, 0), NullObserver())
@@ -170,7 +165,7 @@ def test_a_single_run_gives_samples_of_its_last_distribution() -> None:
     assert (np.abs(found) < 0.05).all()
 
 
-def test_a_run_from_every_start_gives_the_best_of_each() -> None:
+def test_a_run_from_every_start_gives_the_best_of_each():
     starts = np.concatenate([np.ones((2, D)), np.full((1, D), -1.0)])
     key = StreamKey(0, 0)
     found = evolved(objective(SPHERE), starts, CmaEsSettings(), key, NullObserver())

@@ -17,7 +17,6 @@ from chsel.methods.cvo import (
     Cvo,
     CvoSettings,
     Kernel,
-    Product,
     class_field,
     climb,
     climbers_at,
@@ -44,21 +43,21 @@ MESH = trimesh.creation.box([0.12, 0.08, 0.06])
 SDF = SdfGrid.from_mesh(MESH, 0.01, padding=0.03)
 
 
-def scene(count: int = 60) -> KnownPoints:
+def scene(count=60):
     """Free points and 20 contacts around the box."""
     stream = np.random.default_rng(1)
     free = stream.uniform(-0.25, 0.25, (count, 3))
     return KnownPoints(free=free, known=stream.uniform(-0.06, 0.06, (20, 3)))
 
 
-def product_of(points: KnownPoints, kernel: Kernel, sdf: SdfGrid = SDF) -> Product:
+def product_of(points, kernel, sdf=SDF):
     """The inner product by fields, with a surface band of a voxel."""
     parts = ("free", points.free), ("surface", points.contacts)
     fields = {name: class_field(sdf, kernel, sdf.resolution, name) for name, _ in parts}
     return tuple(ClassTerm(part.T.copy(), fields[name]) for name, part in parts)
 
 
-def labels(free: int, surface: int) -> FloatArray:
+def labels(free, surface):
     """Of so many free points, then surface points (N, 2)."""
     return np.concatenate([np.tile(FREE, (free, 1)), np.tile(SURFACE, (surface, 1))])
 
@@ -74,14 +73,7 @@ class DenseClouds:
     ell: float = 0.1
 
     @classmethod
-    def of(
-        cls,
-        sdf: SdfGrid,
-        points: KnownPoints,
-        band: float,
-        *,
-        ell: float = 0.1,
-    ) -> DenseClouds:
+    def of(cls, sdf, points, band, *, ell=0.1):
         nodes = sdf.origin + np.argwhere(sdf.values > -np.inf) * sdf.resolution
         values = sdf.values.reshape(-1)
         free, surface = nodes[values > band], nodes[np.abs(values) <= band]
@@ -90,7 +82,7 @@ class DenseClouds:
         z = np.concatenate([free, surface])
         return cls(x, x_labels, z, labels(len(free), len(surface)), ell)
 
-    def kernel(self, object_from_world: FloatArray) -> FloatArray:
+    def kernel(self, object_from_world):
         """a_ij (N, M) = k(x_i, y_j) s(l_i, m_j)."""
         moved = apply(object_from_world, self.x)
         apart = ((moved[:, None] - self.z) ** 2).sum(-1)
@@ -99,22 +91,22 @@ class DenseClouds:
         a *= S_SIGMA**2 * np.exp(-labels_apart / (2 * S_ELL**2))
         return a
 
-    def product(self, object_from_world: FloatArray) -> float:
+    def product(self, object_from_world):
         """F(X)."""
         return float(self.kernel(object_from_world).sum())
 
-    def flow(self, object_from_world: FloatArray) -> FloatArray:
+    def flow(self, object_from_world):
         """(omega, u) (6,), not normalised, as sums over pairs in the world."""
         a, y = self.kernel(object_from_world), self.y(object_from_world)
         omega = np.einsum("nm,nmk->k", a, np.cross(self.x[:, None], y[None])) / C
         u = np.einsum("nm,nmk->k", a, y[None] - self.x[:, None]) / D
         return np.concatenate([omega, u])
 
-    def y(self, object_from_world: FloatArray) -> FloatArray:
+    def y(self, object_from_world):
         """The object's cloud in the world (M, 3)."""
         return apply(np.linalg.inv(object_from_world), self.z)
 
-    def quartic(self, object_from_world: FloatArray, xi: FloatArray) -> FloatArray:
+    def quartic(self, object_from_world, xi):
         """B, C, D, E: F(G Exp(tau xi)) = F + B tau + C tau^2 + D tau^3 + E tau^4 + ..."""
         a, y, q = self.kernel(object_from_world), self.y(object_from_world), 0.5 / self.ell**2
         apart = self.x[:, None] - y
@@ -123,7 +115,7 @@ class DenseClouds:
         third = np.cross(xi[:3], second)
         fourth = np.cross(xi[:3], third)
 
-        def dot(p: FloatArray, q: FloatArray) -> FloatArray:
+        def dot(p, q):
             return (p * q).sum(-1)
 
         beta = -2 * q * dot(first, apart)
@@ -142,7 +134,7 @@ class DenseClouds:
         )
 
 
-def along(object_from_world: FloatArray, xi: FloatArray, tau: float) -> FloatArray:
+def along(object_from_world, xi, tau):
     """G Exp(tau xi), the exponential by its series."""
     twist = np.zeros((4, 4))
     twist[:3, :3] = np.cross(np.eye(3), tau * xi[:3])
@@ -154,7 +146,7 @@ def along(object_from_world: FloatArray, xi: FloatArray, tau: float) -> FloatArr
     return object_from_world @ total
 
 
-def nearby(count: int, seed: int, reach: float = 0.08) -> FloatArray:
+def nearby(count, seed, reach=0.08):
     """Transforms (count, 4, 4) around the identity."""
     stream = np.random.default_rng(seed)
     turns = rotation_vector(stream.normal(0.0, 0.6, (count, 3)))
@@ -162,7 +154,7 @@ def nearby(count: int, seed: int, reach: float = 0.08) -> FloatArray:
 
 
 @numba.njit(error_model="numpy")
-def flows(product, poses, out):  # type: ignore[no-untyped-def]
+def flows(product, poses, out):
     """Fill out (B, 7) with F, sum x_i x h_i and sum h_i, h = R^T grad f, at poses (B, 12)."""
     for n in range(len(poses)):
         flow = flow_at(product, pose_at(poses, n), (0.0, 0.0, 0.0))
@@ -175,17 +167,15 @@ ASCENT = Ascent(1e-4, 0.8, (0.0, 0.0, 0.0), 7.0, 7.0, -1.0)
 QUICK = CvoSettings(ell_min=0.1, c=7.0, origin="world", max_iterations=12)
 
 
-def problem(
-    points: KnownPoints, initial_set: FloatArray, workspace: Workspace = WORKSPACE
-) -> RegistrationProblem:
+def problem(points, initial_set, workspace=WORKSPACE):
     return RegistrationProblem(SDF, points, initial_set, workspace, 0.02, StreamKey(0, 0))
 
 
-def value(product: Product, object_from_world: FloatArray) -> float:
+def value(product, object_from_world):
     return float(values_of(product, Poses.of(object_from_world[None]).numbers)[0])
 
 
-def direction(product: Product, object_from_world: FloatArray) -> tuple[FloatArray, float]:
+def direction(product, object_from_world):
     """The unit flow (6,), and the slope of F along it."""
     out = np.empty((1, 7))
     flows(product, Poses.of(object_from_world[None]).numbers, out)
@@ -195,12 +185,12 @@ def direction(product: Product, object_from_world: FloatArray) -> tuple[FloatArr
 
 
 @numba.njit
-def moved_along(pose, xi, tau):  # type: ignore[no-untyped-def]
+def moved_along(pose, xi, tau):
     return cvo._moved_along(pose, xi, tau)
 
 
 @pytest.mark.parametrize("tau", [1e-9, 1e-3, 0.019, 0.021, 0.8])
-def test_a_step_is_the_exponential_of_the_flow(tau: float) -> None:
+def test_a_step_is_the_exponential_of_the_flow(tau):
     stream = np.random.default_rng(2)
     turning = stream.normal(size=6)
     for xi in (turning / np.sqrt((turning**2).sum()), np.array([0.0, 0, 0, 0.6, 0, 0.8])):
@@ -210,7 +200,7 @@ def test_a_step_is_the_exponential_of_the_flow(tau: float) -> None:
         np.testing.assert_allclose(found, Poses.of(expected[None]).numbers[0], rtol=0, atol=1e-15)
 
 
-def test_the_flow_is_the_way_uphill_and_its_slope_that_of_the_inner_product() -> None:
+def test_the_flow_is_the_way_uphill_and_its_slope_that_of_the_inner_product():
     points = scene()
     dense, product = DenseClouds.of(SDF, points, 0.01), product_of(points, KERNEL)
     for start in nearby(4, 4):
@@ -222,7 +212,7 @@ def test_the_flow_is_the_way_uphill_and_its_slope_that_of_the_inner_product() ->
         assert slope == pytest.approx((further[0] - further[1]) / 0.01, 0.02)
 
 
-def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion() -> None:
+def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion():
     points = scene()
     dense, product = DenseClouds.of(SDF, points, 0.01), product_of(points, KERNEL)
     gains = []
@@ -242,7 +232,7 @@ def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion() -> None:
     np.testing.assert_array_less(0.0, theirs)
 
 
-def test_the_inner_product_never_falls_and_is_that_of_the_pose() -> None:
+def test_the_inner_product_never_falls_and_is_that_of_the_pose():
     product, starts = product_of(scene(), KERNEL), nearby(5, 7, 0.2)
     climbers = climbers_at(product, Poses.of(starts).numbers)
     for _ in range(30):
@@ -254,7 +244,7 @@ def test_the_inner_product_never_falls_and_is_that_of_the_pose() -> None:
 
 
 @pytest.mark.parametrize("name", ["default", "paper", "reference"])
-def test_a_cloud_matches_itself(name: str) -> None:
+def test_a_cloud_matches_itself(name):
     settings = replace(preset_settings("cvo", name), max_iterations=3)
     band = SDF.resolution if settings.surface_band is None else settings.surface_band
     nodes = SDF.origin + np.argwhere(SDF.values > -np.inf) * SDF.resolution
@@ -271,7 +261,7 @@ def test_a_cloud_matches_itself(name: str) -> None:
     assert rotation[0] < 1e-2
 
 
-def test_the_cost_is_one_minus_the_cosine_of_the_two_clouds() -> None:
+def test_the_cost_is_one_minus_the_cosine_of_the_two_clouds():
     points, starts = scene(), nearby(3, 8)
     found = Cvo(replace(preset_settings("cvo", "paper"), max_iterations=2)).register(
         problem(points, starts)
@@ -287,7 +277,7 @@ def test_the_cost_is_one_minus_the_cosine_of_the_two_clouds() -> None:
     assert (np.diff(found.cost) >= 0.0).all()
 
 
-def _pair_sum(points: FloatArray) -> float:
+def _pair_sum(points):
     return float(
         sum(0.0064 * np.exp(-((points - z) ** 2).sum(axis=1) / 0.02).sum() for z in points)
     )
@@ -298,19 +288,19 @@ WORLD_FROM_OBJECT = compose(
 )
 
 
-def touched_all_over() -> KnownPoints:
+def touched_all_over():
     surface = trimesh.sample.sample_surface(MESH, 400, seed=1)[0]
     lattice = np.indices((21, 21, 21)).reshape(3, -1).T * 0.02 - 0.2
     signed = SDF.at(apply(inverse(WORLD_FROM_OBJECT), lattice))[0]
     return KnownPoints(free=lattice[signed > 0.01], known=apply(WORLD_FROM_OBJECT, surface))
 
 
-def around_truth(count: int) -> FloatArray:
+def around_truth(count):
     noise = inverse(nearby(count, 9, 0.03))
     return inverse(np.einsum("ij,bjk->bik", WORLD_FROM_OBJECT, noise))
 
 
-def test_without_free_space_contacts_all_over_place_the_object() -> None:
+def test_without_free_space_contacts_all_over_place_the_object():
     method = Cvo(preset_settings("cvo_no_free_space"))
     found = method.register(problem(touched_all_over(), around_truth(8)))
     position, _ = pose_errors(found.object_from_world, WORLD_FROM_OBJECT, ObjectSymmetry())
@@ -318,7 +308,7 @@ def test_without_free_space_contacts_all_over_place_the_object() -> None:
     assert found.cost[0] < 0.05
 
 
-def test_an_object_in_a_hole_of_free_space_ends_up_there() -> None:
+def test_an_object_in_a_hole_of_free_space_ends_up_there():
     method: Method = Cvo(replace(preset_settings("cvo"), balanced=True))
     starts = around_truth(4)
     found = method.register(problem(touched_all_over(), starts))
@@ -336,9 +326,7 @@ def test_an_object_in_a_hole_of_free_space_ends_up_there() -> None:
     ],
     ids=["free", "near", "occupied"],
 )
-def test_without_a_point_to_use_the_starts_come_back(
-    settings: CvoSettings, points: KnownPoints
-) -> None:
+def test_without_a_point_to_use_the_starts_come_back(settings, points):
     starts = nearby(4, 10)
     starts[2] = starts[0]
     found = Cvo(settings).register(problem(points, starts))
@@ -348,7 +336,7 @@ def test_without_a_point_to_use_the_starts_come_back(
 
 
 @pytest.mark.parametrize("origin", ["world", "workspace"])
-def test_a_start_that_meets_no_point_stays_where_it_is(origin: str) -> None:
+def test_a_start_that_meets_no_point_stays_where_it_is(origin):
     starts = nearby(3, 11)
     starts[1, :3, 3] += 5.0
     shifted = Workspace((-1.0, -0.3, -0.3), (0.3, 0.3, 0.3))
@@ -359,7 +347,7 @@ def test_a_start_that_meets_no_point_stays_where_it_is(origin: str) -> None:
     assert found.cost[1] < 0.9
 
 
-def test_each_start_climbs_as_if_it_were_alone_on_any_number_of_threads() -> None:
+def test_each_start_climbs_as_if_it_were_alone_on_any_number_of_threads():
     points, starts = scene(), nearby(5, 13, 0.2)
     with threads(2):
         together = Cvo(QUICK).register(problem(points, starts))
@@ -369,7 +357,7 @@ def test_each_start_climbs_as_if_it_were_alone_on_any_number_of_threads() -> Non
     np.testing.assert_array_equal(together.object_from_world, expected)
 
 
-def test_an_observer_sees_the_costs_fall() -> None:
+def test_an_observer_sees_the_costs_fall():
     posed, watcher = problem(scene(), nearby(4, 14)), Watcher()
     watched = Cvo(QUICK).register(posed, watcher)
     assert watcher.iterations == [0, 10, 12]
@@ -379,7 +367,7 @@ def test_an_observer_sees_the_costs_fall() -> None:
     np.testing.assert_array_equal(np.sort(costs[-1]), watched.cost)
 
 
-def test_the_length_scale_falls_from_ascent_to_ascent() -> None:
+def test_the_length_scale_falls_from_ascent_to_ascent():
     settings = replace(QUICK, ell=0.1, ell_min=0.03, ell_decay=0.5, stop_below=None)
     assert settings.levels == [0.1, 0.05, 0.03]
     watcher = Watcher()
@@ -396,7 +384,7 @@ def test_the_length_scale_falls_from_ascent_to_ascent() -> None:
     assert (coarse.cost < found.cost - 0.1).all()
 
 
-def test_turning_about_the_workspace_the_place_of_the_world_does_not_matter() -> None:
+def test_turning_about_the_workspace_the_place_of_the_world_does_not_matter():
     points, starts = scene(), nearby(3, 16)
     shift = np.array([3.0, -2.0, 1.0])
     away = KnownPoints(free=points.free + shift, known=points.known + shift)
@@ -411,7 +399,7 @@ def test_turning_about_the_workspace_the_place_of_the_world_does_not_matter() ->
     assert np.abs(in_world.cost - here.cost).max() > 1e-6
 
 
-def test_balanced_contacts_weigh_as_much_as_free_points() -> None:
+def test_balanced_contacts_weigh_as_much_as_free_points():
     points, starts = scene(60), nearby(3, 17)
     thrice = KnownPoints(free=points.free, known=np.repeat(points.known, 3, axis=0))
     balanced = Cvo(replace(QUICK, balanced=True)).register(problem(points, starts))
@@ -423,11 +411,11 @@ def test_balanced_contacts_weigh_as_much_as_free_points() -> None:
     assert np.abs(plain.object_from_world - balanced.object_from_world).max() > 1e-3
 
 
-def values(product: Product, transforms: FloatArray) -> FloatArray:
+def values(product, transforms):
     return values_of(product, Poses.of(transforms).numbers)
 
 
-def flow(product: Product, transforms: FloatArray) -> FloatArray:
+def flow(product, transforms):
     """Sums (B, 6) over x_i x h_i and h_i."""
     out = np.full((len(transforms), 7), np.nan)
     flows(product, Poses.of(transforms).numbers, out)
@@ -435,7 +423,7 @@ def flow(product: Product, transforms: FloatArray) -> FloatArray:
     return out[:, 1:]
 
 
-def test_a_field_gives_what_the_sum_over_all_pairs_gives() -> None:
+def test_a_field_gives_what_the_sum_over_all_pairs_gives():
     points, transforms = scene(), nearby(6, 0)
     dense = DenseClouds.of(SDF, points, SDF.resolution)
     product = product_of(points, KERNEL)
@@ -449,7 +437,7 @@ def test_a_field_gives_what_the_sum_over_all_pairs_gives() -> None:
     np.testing.assert_allclose(found / sizes, wanted / sizes, rtol=0, atol=0.01)
 
 
-def test_at_the_nodes_a_field_is_the_sum_but_for_its_truncation() -> None:
+def test_at_the_nodes_a_field_is_the_sum_but_for_its_truncation():
     nodes = SDF.origin + np.array([[0, 0, 0], [8, 7, 5], [3, 11, 2]]) * SDF.resolution
     points = KnownPoints(free=nodes, known=nodes)
     dense = DenseClouds.of(SDF, points, SDF.resolution)
@@ -457,7 +445,7 @@ def test_at_the_nodes_a_field_is_the_sum_but_for_its_truncation() -> None:
     assert values(product_of(points, KERNEL), np.eye(4)[None])[0] == pytest.approx(expected, 1e-6)
 
 
-def test_a_coarser_field_stands_for_a_fine_grid_all_the_same() -> None:
+def test_a_coarser_field_stands_for_a_fine_grid_all_the_same():
     fine = SdfGrid.from_mesh(trimesh.creation.box([0.06, 0.04, 0.03]), 0.004, padding=0.02)
     points, transforms = scene(60), nearby(4, 5)
     dense = DenseClouds.of(fine, points, fine.resolution)
@@ -468,7 +456,7 @@ def test_a_coarser_field_stands_for_a_fine_grid_all_the_same() -> None:
     np.testing.assert_allclose(values(product, transforms), expected, rtol=0, atol=0.002 * most)
 
 
-def pair_sum(points: FloatArray) -> float:
+def pair_sum(points):
     total = 0.0
     for point in points:
         apart = np.minimum(np.abs(points - point), 1e3)
@@ -477,12 +465,12 @@ def pair_sum(points: FloatArray) -> float:
 
 
 @pytest.mark.parametrize("count", [50, 2100])
-def test_the_norm_of_a_cloud_is_the_sum_over_its_pairs(count: int) -> None:
+def test_the_norm_of_a_cloud_is_the_sum_over_its_pairs(count):
     points = np.random.default_rng(0).uniform(-0.2, 0.3, (count, 3))
     assert cloud_norm(points, KERNEL, 0.01) == pytest.approx(pair_sum(points), 1e-12)
 
 
-def test_the_norm_of_lattice_points_is_that_of_a_field_at_its_nodes() -> None:
+def test_the_norm_of_lattice_points_is_that_of_a_field_at_its_nodes():
     lattice = np.indices((14, 15, 16)).reshape(3, -1).T
     points = (lattice * 0.0228)[np.random.default_rng(0).random(len(lattice)) < 0.9] + 0.1234
     found = cloud_norm(points, KERNEL, 0.0228)
@@ -490,7 +478,7 @@ def test_the_norm_of_lattice_points_is_that_of_a_field_at_its_nodes() -> None:
 
 
 @pytest.mark.parametrize("spacing", [0.01, 0.0228])
-def test_a_cube_of_points_is_as_good_as_its_points(spacing: float) -> None:
+def test_a_cube_of_points_is_as_good_as_its_points(spacing):
     lattice = (np.indices((20, 20, 20)).reshape(3, -1).T - 10.0) * spacing
     points = lattice[~(np.abs(lattice) < 4.5 * spacing).all(axis=1)]
     alone, centres, wide = full_cubes(points, KERNEL, spacing)
@@ -508,7 +496,7 @@ def test_a_cube_of_points_is_as_good_as_its_points(spacing: float) -> None:
     np.testing.assert_allclose(flow(with_cubes, transforms) / size, wanted / size, atol=0.005)
 
 
-def test_cubes_are_made_of_full_lattices_alone() -> None:
+def test_cubes_are_made_of_full_lattices_alone():
     off = np.random.default_rng(0).uniform(-0.2, 0.2, (3000, 3))
     for points in (off, off[:5], np.zeros((0, 3))):
         alone, centres, _ = full_cubes(points, KERNEL, 0.01)

@@ -1,7 +1,5 @@
 """The energy of poses in kernels against its plain formula."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -26,7 +24,7 @@ SENSOR = 0.0005
 TABLE_ERROR = 0.25**2 / 8.0  # nats a point: of chords of a parabola, a quarter of sigma long
 
 
-def points_with(contacts: int) -> KnownPoints:
+def points_with(contacts):
     """Contacts, one of which is outside of the grid and one far off, and points of other kinds."""
     known, values = contacts_on(BOX, contacts), 0.005 * RANDOM.standard_normal(contacts)
     return KnownPoints(
@@ -37,7 +35,7 @@ def points_with(contacts: int) -> KnownPoints:
     )
 
 
-def near_and_far() -> Poses:
+def near_and_far():
     """Most have free voxels in the object, some far more than WRONG allows."""
     places = np.random.default_rng(2).uniform(-0.1, 0.5, (8, 3))
     turns = random_rotations(np.random.default_rng(1), 8)
@@ -56,7 +54,7 @@ def near_and_far() -> Poses:
     ],
     ids=["few contacts", "many contacts", "exact contacts", "free", "occupied"],
 )
-def test_energy_is_the_plain_formula(points: KnownPoints, shared: float) -> None:
+def test_energy_is_the_plain_formula(points, shared):
     noise, poses = noise_model(SENSOR, shared), near_and_far()
     expected = plain_energies(noise, BOX_GRID, points, poses)
     assert np.ptp(expected) > 1.5 * WRONG
@@ -65,7 +63,7 @@ def test_energy_is_the_plain_formula(points: KnownPoints, shared: float) -> None
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9 + TABLE_ERROR * counted)
 
 
-def test_the_same_points_by_another_noise() -> None:
+def test_the_same_points_by_another_noise():
     points, poses = points_with(6), near_and_far()
     energy = energy_of(points, noise_model(SENSOR))
     other = noise_model(0.003, 0.002)

@@ -1,12 +1,9 @@
 """Fits of poses: that they lower the written likelihood until it has a minimum."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.optimize import minimize
 
 from chsel.methods.anchored.fitting import fitted, twists_of
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.noise import LEVELS, NoiseModel, noise_model
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, axis_angle, compose, rotation_angle
@@ -41,13 +38,13 @@ AT_ODDS = KnownPoints(
 """Contacts off by 1 mm, one on another object, and free and occupied voxels that are wrong."""
 
 
-def off_truth(poses: Poses) -> tuple[FloatArray, FloatArray]:
+def off_truth(poses):
     """Metres and radians (B,)."""
     off = Poses.of(poses.matrices @ TRUTH)
     return np.sqrt((off.translations**2).sum(axis=1)), rotation_angle(off.rotations)
 
 
-def test_a_fit_ends_where_no_motion_lowers_the_plain_formula() -> None:
+def test_a_fit_ends_where_no_motion_lowers_the_plain_formula():
     """Points of all classes disagree there, so that each must have its weight and its sign."""
     poses = poses_around_truth(6, 0.01, 0.1)
     found = fitted(energy_of(AT_ODDS, NOISE), TWISTS, poses, 60)
@@ -55,7 +52,7 @@ def test_a_fit_ends_where_no_motion_lowers_the_plain_formula() -> None:
     after = plain_energies(NOISE, BOX_GRID, AT_ODDS, found)
     assert (after < before - 10.0).all()
 
-    def moved(twist: FloatArray) -> float:
+    def moved(twist):
         angle = np.sqrt((twist[:3] ** 2).sum())
         turn = axis_angle(twist[:3] / max(angle, 1e-9), angle / 0.1)
         pose = Poses.of((compose(turn, twist[3:]) @ found.matrices[0])[None])
@@ -70,7 +67,7 @@ def test_a_fit_ends_where_no_motion_lowers_the_plain_formula() -> None:
     assert abs(known[24] - 0.03) < 0.002  # the foreign contact moves nothing
 
 
-def test_fits_by_rough_then_exact_noise_come_from_afar() -> None:
+def test_fits_by_rough_then_exact_noise_come_from_afar():
     rough = NoiseModel((0.015,) * LEVELS, (1.0 / LEVELS,) * LEVELS, softness=0.01, wrong=50.0)
     points = KnownPoints(known=np.concatenate([apply(TRUTH, on_faces(24)), FOREIGN]))
     energy = energy_of(points, NOISE)
@@ -81,13 +78,13 @@ def test_fits_by_rough_then_exact_noise_come_from_afar() -> None:
     assert (np.array(off_truth(poses)) > [[0.029], [0.29]]).all()
 
 
-def test_no_fit_raises_an_energy_and_none_of_no_steps_moves() -> None:
+def test_no_fit_raises_an_energy_and_none_of_no_steps_moves():
     energy, poses = energy_of(AT_ODDS, NOISE), poses_around_truth(40, 0.1, 1.5)
     assert (energy.of(fitted(energy, TWISTS, poses, 4)) <= energy.of(poses)).all()
     np.testing.assert_array_equal(fitted(energy, TWISTS, poses, 0).numbers, poses.numbers)
 
 
-def test_on_a_plane_fits_stay_on_it() -> None:
+def test_on_a_plane_fits_stay_on_it():
     space = search_space(PlaneSettings(plane_height=0.3), BOX_GRID)
     poses = space.poses(space.encode(poses_around_truth(6, 0.01, 0.1)))
     energy = energy_of(KnownPoints(known=contacts_on(BOX, 20)), NOISE)

@@ -13,7 +13,6 @@ from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.objective import Objective
 from chsel.methods.gradient_descent import DescentSettings, descend
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
@@ -25,24 +24,22 @@ SIDES = np.array([0.12, 0.08, 0.06])
 BOX = SdfGrid.from_mesh(trimesh.creation.box(SIDES), 0.01)
 
 
-def starts(count: int, seed: int = 0, reach: float = 0.02) -> FloatArray:
+def starts(count, seed=0, reach=0.02):
     return random_poses(np.random.default_rng(seed), count, reach)
 
 
-def scene(seed: int = 0) -> KnownPoints:
+def scene(seed=0):
     stream = np.random.default_rng(seed)
     near = stream.uniform(-0.08, 0.08, (200, 3))
     return KnownPoints(near[:150], near[150:160], near[160:], stream.uniform(-0.01, 0.01, 40))
 
 
-def contacts() -> Objective:
+def contacts():
     """One contact, so that many poses cost nothing."""
     return Objective(CompiledCost(BOX, KnownPoints(known=[[0.02, 0.0, 0.01]])), SE3Space())
 
 
-def descended_by_torch(
-    cost: RelaxedCost, space: SearchSpace, vectors: FloatArray, rate: float, iterations: int
-) -> FloatArray:
+def descended_by_torch(cost, space, vectors, rate, iterations):
     """torch.optim.Adam on the mean of the costs."""
     leaves: Tensor = torch.tensor(vectors, requires_grad=True)
     optimizer = torch.optim.Adam([leaves], lr=rate)
@@ -57,7 +54,7 @@ def descended_by_torch(
 @pytest.mark.parametrize(("free_term", "lookup"), [
     ("direct", "trilinear"), ("direct", "nearest"), ("interior", "trilinear"),
 ])  # fmt: skip
-def test_descent_takes_the_steps_of_torch(free_term: str, lookup: str, plane: bool) -> None:
+def test_descent_takes_the_steps_of_torch(free_term, lookup, plane):
     space: SearchSpace = SE3Space()
     if plane:
         space = SE2Space(PlaneSettings(axis=(0.0, 0.6, 0.8), offset=0.0), BOX)
@@ -70,7 +67,7 @@ def test_descent_takes_the_steps_of_torch(free_term: str, lookup: str, plane: bo
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
 
 
-def test_no_iteration_moves_nothing_and_one_moves_each_number_by_the_rate() -> None:
+def test_no_iteration_moves_nothing_and_one_moves_each_number_by_the_rate():
     objective, vectors = contacts(), SE3Space().encode(Poses.of(starts(4)))
     np.testing.assert_array_equal(objective.descended(vectors, 4.0, 0.01, 0), vectors)
     _, gradients = objective.costs_and_gradients(vectors)
@@ -79,7 +76,7 @@ def test_no_iteration_moves_nothing_and_one_moves_each_number_by_the_rate() -> N
     np.testing.assert_allclose(step, expected, rtol=1e-9, atol=1e-14)
 
 
-def test_descent_moves_the_surface_onto_the_contacts() -> None:
+def test_descent_moves_the_surface_onto_the_contacts():
     """Poses at rest: |s| = 0 for contacts in the middles of all six faces."""
     middles = np.concatenate([np.diag(SIDES / 2.0), -np.diag(SIDES / 2.0)])
     objective = Objective(CompiledCost(BOX, KnownPoints(known=middles)), SE3Space())
@@ -93,13 +90,13 @@ def test_descent_moves_the_surface_onto_the_contacts() -> None:
     np.testing.assert_array_equal(costs, objective.costs(SE3Space().encode(poses)))
 
 
-def rotations_near_identity(count: int) -> FloatArray:
+def rotations_near_identity(count):
     rows = np.eye(3)[None] + np.random.default_rng(1).uniform(-0.1, 0.1, (count, 3, 3))
     vectors = torch.tensor(np.concatenate([rows[:, :2].reshape(-1, 6), rows[:, 2]], axis=1))
     return decode(SE3Space(), vectors)[0].numpy()
 
 
-def test_descent_reports_every_block_as_it_stands() -> None:
+def test_descent_reports_every_block_as_it_stands():
     objective, blocks = contacts(), Watcher()
     settings = DescentSettings(restarts=4, iterations=5, rate=0.001, stop_below=None)
     poses, costs = descend(objective, Poses.of(starts(3)), settings, blocks)
@@ -115,7 +112,7 @@ def test_descent_reports_every_block_as_it_stands() -> None:
     np.testing.assert_array_equal(costs, blocks.traces[-1].cost)
 
 
-def test_descent_ends_when_a_block_gains_nothing_unless_told_not_to() -> None:
+def test_descent_ends_when_a_block_gains_nothing_unless_told_not_to():
     free = KnownPoints(free=[[1.0, 1.0, 1.0]])  # costs nothing anywhere near
     objective = Objective(CompiledCost(BOX, free), SE3Space())
     stopping, going = Watcher(), Watcher()
@@ -125,7 +122,7 @@ def test_descent_ends_when_a_block_gains_nothing_unless_told_not_to() -> None:
     assert going.iterations == list(range(0, 501, 50))
 
 
-def test_descent_goes_on_while_the_mean_gain_of_a_block_is_above_the_bound() -> None:
+def test_descent_goes_on_while_the_mean_gain_of_a_block_is_above_the_bound():
     objective = contacts()
     blocks = Watcher()
     settings = DescentSettings(restarts=12, iterations=10, rate=0.001, stop_below=0.05)
@@ -140,7 +137,7 @@ def test_descent_goes_on_while_the_mean_gain_of_a_block_is_above_the_bound() -> 
     assert gains[-1] <= 0.05 or len(gains) == 12
 
 
-def test_no_restart_returns_the_starts() -> None:
+def test_no_restart_returns_the_starts():
     objective = contacts()
     poses, costs = descend(
         objective, Poses.of(starts(3)), DescentSettings(restarts=0), NullObserver()
@@ -150,7 +147,7 @@ def test_no_restart_returns_the_starts() -> None:
     assert (costs > 0.0).all()
 
 
-def test_each_start_descends_as_if_it_were_alone() -> None:
+def test_each_start_descends_as_if_it_were_alone():
     objective = Objective(CompiledCost(BOX, scene()), SE3Space())
     vectors = SE3Space().encode(Poses.of(starts(4)))
     together = objective.descended(vectors, 4.0, 0.01, 20)
@@ -158,7 +155,7 @@ def test_each_start_descends_as_if_it_were_alone() -> None:
     np.testing.assert_array_equal(together[2:3], alone)
 
 
-def test_only_the_lowest_go_on_in_a_race_and_move_as_they_would_without_one() -> None:
+def test_only_the_lowest_go_on_in_a_race_and_move_as_they_would_without_one():
     objective, racing, free = contacts(), Watcher(), Watcher()
     settings = DescentSettings(restarts=3, iterations=5, rate=0.001, stop_below=None)
     race = replace(settings, race=(1.0, 0.5, 0.2))

@@ -1,7 +1,3 @@
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 import trimesh
@@ -10,7 +6,6 @@ from scipy.spatial import cKDTree
 from chsel import KnownPoints, RegistrationProblem, SdfGrid
 from chsel.methods import preset_settings
 from chsel.methods.icp import Icp, IcpSettings
-from chsel.numerics.arrays import FloatArray
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.poses import apply, compose, inverse, random_rotations
@@ -32,30 +27,30 @@ DENSE = IcpSettings(surface_points=5000)
 
 
 def posed(
-    known: Any = CONTACTS,
-    initial_set: FloatArray | None = None,
-    key: StreamKey = StreamKey(5, 2),  # noqa: B008, which is frozen
-    **points: Any,
-) -> RegistrationProblem:
+    known=CONTACTS,
+    initial_set=None,
+    key=StreamKey(5, 2),  # noqa: B008, which is frozen
+    **points,
+):
     initial_set = around_truth(angle=0.4) if initial_set is None else initial_set
     return RegistrationProblem(
         GRID, KnownPoints(known=known, **points), initial_set, WORKSPACE, 0.02, key
     )
 
 
-def after(problem: RegistrationProblem, iterations: int) -> FloatArray:
+def after(problem, iterations):
     """The transforms (B, 4, 4) after so many iterations, in the order of E_0."""
     kept = Watcher()
     Icp(IcpSettings(iterations=iterations, stop_below=None)).register(problem, kept)
     return last_transforms(kept)
 
 
-def last_transforms(kept: Watcher) -> FloatArray:
+def last_transforms(kept):
     """The transforms (B, 4, 4) of the last trace."""
     return SE3Space().poses(kept.traces[-1].vectors).matrices
 
 
-def test_every_iteration_is_that_of_trimesh() -> None:
+def test_every_iteration_is_that_of_trimesh():
     problem = posed()
     model = Icp().surface(problem)
     tree = cKDTree(model)
@@ -71,7 +66,7 @@ def test_every_iteration_is_that_of_trimesh() -> None:
         np.testing.assert_allclose(after(problem, iteration), transforms, rtol=0, atol=1e-9)
 
 
-def test_where_it_converges_is_where_trimesh_does() -> None:
+def test_where_it_converges_is_where_trimesh_does():
     problem = posed()
     model, kept = Icp().surface(problem), Watcher()
     found = Icp(IcpSettings(stop_below=0.0)).register(problem, kept)
@@ -87,7 +82,7 @@ def test_where_it_converges_is_where_trimesh_does() -> None:
     np.testing.assert_allclose(found.cost, costs, rtol=1e-6)
 
 
-def test_the_object_is_found_where_it_was_touched_all_over() -> None:
+def test_the_object_is_found_where_it_was_touched_all_over():
     method = Icp(DENSE)
     found = method.register(posed())
     position, rotation = pose_errors(found.object_from_world, TRUTH, ObjectSymmetry())
@@ -102,7 +97,7 @@ def test_the_object_is_found_where_it_was_touched_all_over() -> None:
         assert cost == pytest.approx(np.sqrt((distances**2).mean()), rel=1e-12)
 
 
-def test_exact_touches_of_a_large_object_are_met_to_two_millimetres() -> None:
+def test_exact_touches_of_a_large_object_are_met_to_two_millimetres():
     """Their true residual is 0; with points of the surface too far apart it is 3.4 mm."""
     sides = np.array([0.2, 0.15, 0.22])
     box = trimesh.creation.box(sides)
@@ -117,7 +112,7 @@ def test_exact_touches_of_a_large_object_are_met_to_two_millimetres() -> None:
     assert np.median(residuals) < 0.002
 
 
-def test_it_stops_at_the_first_iteration_in_which_no_start_gains() -> None:
+def test_it_stops_at_the_first_iteration_in_which_no_start_gains():
     problem, kept = posed(), Watcher()
     Icp(IcpSettings(stop_below=1e-3)).register(problem, kept)
     every = [after(problem, n) for n in range(1, kept.iterations[-1] + 1)]
@@ -139,7 +134,7 @@ def test_it_stops_at_the_first_iteration_in_which_no_start_gains() -> None:
     assert [done for _, done, _ in kept.progressed] == kept.iterations[1:]
 
 
-def test_contacts_alone_count() -> None:
+def test_contacts_alone_count():
     problem, method = posed(), Icp()
     first = method.register(problem).digest
     free = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
@@ -150,7 +145,7 @@ def test_contacts_alone_count() -> None:
     assert method.register(problem).digest == first
 
 
-def test_surface_points_stay_or_change_as_the_preset_says() -> None:
+def test_surface_points_stay_or_change_as_the_preset_says():
     first, later, other = (posed(key=StreamKey(*key)) for key in ((5, 2), (5, 3), (6, 2)))
     presets = (("default", 2000, True), ("paper", 500, False), ("reference", 500, True))
     for preset, count, stays in presets:
@@ -162,7 +157,7 @@ def test_surface_points_stay_or_change_as_the_preset_says() -> None:
         assert not np.array_equal(points, method.surface(other))
 
 
-def test_what_contacts_leave_open_stays_as_it_was() -> None:
+def test_what_contacts_leave_open_stays_as_it_was():
     problem = posed(CONTACTS[:1])
     np.testing.assert_allclose(
         after(problem, 5)[:, :3, :3], problem.initial_set[:, :3, :3], atol=1e-12
@@ -182,7 +177,7 @@ def test_what_contacts_leave_open_stays_as_it_was() -> None:
         assert np.trace(turn) == pytest.approx(1.0 + 2.0 * cosine, abs=1e-9)
 
 
-def test_contacts_matched_with_one_point_do_not_turn_the_object() -> None:
+def test_contacts_matched_with_one_point_do_not_turn_the_object():
     far = around_truth(30, 0.4)
     far[:, :3, 3] *= 1.0 + 2.0 * np.arange(30)[:, None]
     problem = posed(initial_set=far)
@@ -193,7 +188,7 @@ def test_contacts_matched_with_one_point_do_not_turn_the_object() -> None:
     np.testing.assert_allclose(turned, far[alone, :3, :3], atol=1e-9)
 
 
-def test_mirrored_contacts_are_not_met_by_a_reflection() -> None:
+def test_mirrored_contacts_are_not_met_by_a_reflection():
     mirrored = apply(TRUTH, apply(inverse(TRUTH), CONTACTS) * [1.0, 1.0, -1.0])
     turns = random_rotations(np.random.default_rng(0), 20)
     initial_set = inverse(compose(turns, np.tile(TRUTH[:3, 3], (20, 1))))
@@ -202,14 +197,14 @@ def test_mirrored_contacts_are_not_met_by_a_reflection() -> None:
     assert found.cost[0] > 2.0 * Icp(DENSE).register(posed()).cost[0]
 
 
-def test_without_contacts_the_initial_set_comes_back() -> None:
+def test_without_contacts_the_initial_set_comes_back():
     problem = posed(np.zeros((0, 3)), free=[[0.0, 0.0, 0.0]])
     found = Icp().register(problem)
     np.testing.assert_array_equal(found.object_from_world, problem.initial_set)
     np.testing.assert_array_equal(found.cost, np.zeros(8))
 
 
-def test_one_start_and_no_iteration_will_do() -> None:
+def test_one_start_and_no_iteration_will_do():
     problem = posed(initial_set=around_truth(1, 0.4))
     found = Icp(IcpSettings(iterations=0)).register(problem)
     np.testing.assert_array_equal(found.object_from_world, problem.initial_set)

@@ -22,7 +22,6 @@ from chsel.methods.medial_constraint import (
     MedialCostSettings,
     medial_balls,
 )
-from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import Poses, apply, compose
 from chsel.problem.registration_problem import RegistrationProblem
@@ -36,11 +35,11 @@ ORIGIN = np.array([0.3, -0.2, 0.011])
 WORKSPACE = Workspace((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
 
 
-def centres(voxels: IntArray) -> FloatArray:
+def centres(voxels):
     return ORIGIN + SIDE * voxels
 
 
-def free_voxels(seed: int, share: float) -> BoolArray:
+def free_voxels(seed, share):
     """Voxels of a 12^3 grid within random balls, some left out."""
     random = np.random.default_rng(seed)
     places = np.indices((12, 12, 12)).reshape(3, -1).T
@@ -50,7 +49,7 @@ def free_voxels(seed: int, share: float) -> BoolArray:
     return inside.reshape(12, 12, 12)
 
 
-def clearance(free: BoolArray) -> FloatArray:
+def clearance(free):
     """Distance of every free voxel's centre to the nearest cube that is not free, in metres."""
     around = np.pad(free, 1)
     apart = np.abs(np.argwhere(free)[:, None] + 1 - np.argwhere(~around)[None])
@@ -58,7 +57,7 @@ def clearance(free: BoolArray) -> FloatArray:
     return SIDE * np.sqrt(squares.min(axis=1))
 
 
-def of_brute_force(free: BoolArray, inflation: float) -> Balls:
+def of_brute_force(free, inflation):
     """The largest medial ball that none of the chosen ones covers, again and again."""
     voxels, radii = np.argwhere(free), clearance(free)
     apart = SIDE * np.sqrt(((voxels[:, None] - voxels[None]) ** 2).sum(axis=2))
@@ -79,7 +78,7 @@ def of_brute_force(free: BoolArray, inflation: float) -> Balls:
     share=st.sampled_from([0.5, 0.95, 1.0]),
     inflation=st.sampled_from([0.0, 0.0213, 0.0413, 0.1037]),  # no sums of sides: these may tie
 )
-def test_balls_are_those_of_brute_force(seed: int, share: float, inflation: float) -> None:
+def test_balls_are_those_of_brute_force(seed, share, inflation):
     free = free_voxels(seed, share)
     if not free.any():
         return
@@ -91,9 +90,7 @@ def test_balls_are_those_of_brute_force(seed: int, share: float, inflation: floa
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), inflation=st.sampled_from([0.0, 0.02, 0.06]))
-def test_balls_lie_within_free_cubes_and_cover_them_but_for_inflation(
-    seed: int, inflation: float
-) -> None:
+def test_balls_lie_within_free_cubes_and_cover_them_but_for_inflation(seed, inflation):
     free = free_voxels(seed, 0.98)
     if not free.any():
         return
@@ -110,14 +107,14 @@ def test_balls_lie_within_free_cubes_and_cover_them_but_for_inflation(
     assert outside.max() <= inflation - SIDE / 2.0 + 0.02 * SIDE
 
 
-def test_one_cube_of_free_space_is_one_ball() -> None:
+def test_one_cube_of_free_space_is_one_ball():
     voxels = np.argwhere(np.ones((5, 5, 5), dtype=bool))
     balls = medial_balls(centres(voxels), WORKSPACE, SIDE, 0.1)
     np.testing.assert_allclose(balls.centres, [centres(np.array([2, 2, 2]))])
     np.testing.assert_allclose(balls.radii, [2.5 * SIDE])
 
 
-def test_the_order_of_points_and_points_off_the_lattice_change_nothing() -> None:
+def test_the_order_of_points_and_points_off_the_lattice_change_nothing():
     random = np.random.default_rng(0)
     points = centres(np.argwhere(free_voxels(0, 1.0)))
     expected = medial_balls(points, WORKSPACE, SIDE, 0.02)
@@ -131,7 +128,7 @@ def test_the_order_of_points_and_points_off_the_lattice_change_nothing() -> None
         np.testing.assert_array_equal(found.radii, expected.radii)
 
 
-def test_what_is_beyond_the_workspace_is_not_free() -> None:
+def test_what_is_beyond_the_workspace_is_not_free():
     voxels = np.argwhere(np.ones((9, 5, 5), dtype=bool))
     half = Workspace(tuple(ORIGIN - 0.1 * SIDE), tuple(ORIGIN + SIDE * np.array([4.0, 9.0, 9.0])))
     found = medial_balls(centres(voxels), half, SIDE, 0.02)
@@ -142,7 +139,7 @@ def test_what_is_beyond_the_workspace_is_not_free() -> None:
         assert len(medial_balls(points, where, SIDE, 0.02).radii) == 0
 
 
-def test_points_over_too_many_voxels_are_an_error_that_says_so() -> None:
+def test_points_over_too_many_voxels_are_an_error_that_says_so():
     points = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
     with pytest.raises(SettingError, match=r"span 1\.0e\+09 voxels of 0\.001 m; accepted"):
         medial_balls(points, WORKSPACE, 0.001, 0.02)
@@ -155,32 +152,32 @@ IDENTITY = Poses.of(np.eye(4)[None])
 GRID = ball_grid(RADIUS, 0.01, 15)
 
 
-def problem(points: KnownPoints) -> RegistrationProblem:
+def problem(points):
     workspace = Workspace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     return RegistrationProblem(GRID, points, IDENTITY.matrices, workspace, 0.025, StreamKey(0, 0))
 
 
-def contacts(count: int = 7) -> KnownPoints:
+def contacts(count=7):
     random = np.random.default_rng(1)
     return KnownPoints(known=random.uniform(-0.2, 0.2, (count, 3)))
 
 
-def some_balls(count: int = 40) -> Balls:
+def some_balls(count=40):
     random = np.random.default_rng(2)
     return Balls(random.uniform(-0.4, 0.4, (count, 3)), random.uniform(0.01, 0.3, count))
 
 
-def poses(count: int = 50) -> FloatArray:
+def poses(count=50):
     return random_poses(np.random.default_rng(3), count, 0.1)
 
 
-def test_a_ball_of_1_m_around_the_centre_of_a_sphere_of_10_cm_costs_1_21() -> None:
+def test_a_ball_of_1_m_around_the_centre_of_a_sphere_of_10_cm_costs_1_21():
     balls = Balls(np.zeros((1, 3)), np.ones(1))
     cost = MedialCost(problem(KnownPoints(known=[[RADIUS, 0.0, 0.0]])), balls=balls)
     np.testing.assert_allclose(cost.evaluate(IDENTITY), 1.21, rtol=1e-12)
 
 
-def test_costs_are_means_of_squares_in_square_metres() -> None:
+def test_costs_are_means_of_squares_in_square_metres():
     points = KnownPoints(known=[[0.13, 0, 0], [0, 0.08, 0], [0, 0, 0.1]], known_sdf=[0, 0, -0.01])
     balls = Balls(np.array([[0.0, 0.12, 0.0], [0.0, 0.0, 0.9]]), np.array([0.05, 0.05]))
     ball_mean = 0.03**2 / 2.0  # the second is beyond the grid and misses
@@ -191,7 +188,7 @@ def test_costs_are_means_of_squares_in_square_metres() -> None:
     np.testing.assert_allclose(scaled.evaluate(IDENTITY), ball_mean + 3.0 * known_mean, rtol=1e-9)
 
 
-def test_a_missing_set_costs_nothing() -> None:
+def test_a_missing_set_costs_nothing():
     alone = MedialCost(problem(KnownPoints(occupied=np.zeros((1, 3)))))
     np.testing.assert_array_equal(alone.evaluate(Poses.of(poses())), 0.0)
     no_balls = MedialCost(problem(contacts()), MedialCostSettings(known_scale=0.0))
@@ -200,13 +197,13 @@ def test_a_missing_set_costs_nothing() -> None:
 
 @pytest.mark.parametrize("outside", OUTSIDE)
 @pytest.mark.parametrize("lookup", LOOKUPS)
-def test_costs_are_those_of_the_equation(lookup: str, outside: str) -> None:
+def test_costs_are_those_of_the_equation(lookup, outside):
     balls, points = some_balls(), contacts()
     cost = MedialCost(
         problem(points), MedialCostSettings(lookup=lookup, outside=outside), balls=balls
     )
 
-    def distances(of: FloatArray) -> FloatArray:
+    def distances(of):
         moved = apply(poses(), of)
         s, _ = GRID.at(moved.reshape(-1, 3), lookup=lookup, outside=outside)
         return s.reshape(moved.shape[:2])
@@ -219,12 +216,12 @@ def test_costs_are_those_of_the_equation(lookup: str, outside: str) -> None:
 
 
 @numba.njit
-def search(model, space, vectors, costs, work):  # type: ignore[no-untyped-def]
+def search(model, space, vectors, costs, work):
     costs_of(model, space, vectors, costs, work)
 
 
 @pytest.mark.parametrize("lookup", LOOKUPS)
-def test_searches_go_by_the_same_costs(lookup: str) -> None:
+def test_searches_go_by_the_same_costs(lookup):
     for balls in (some_balls(), Balls(np.zeros((0, 3)), np.zeros(0))):
         cost = MedialCost(problem(contacts()), MedialCostSettings(lookup=lookup), balls=balls)
         vectors = cost.space.encode(Poses.of(poses(80)))
@@ -235,7 +232,7 @@ def test_searches_go_by_the_same_costs(lookup: str) -> None:
         np.testing.assert_allclose(found, cost.costs(vectors), rtol=1e-12)
 
 
-def test_the_true_pose_among_balls_of_its_own_free_space_costs_almost_nothing() -> None:
+def test_the_true_pose_among_balls_of_its_own_free_space_costs_almost_nothing():
     lattice = 0.025 * np.indices((21, 21, 21)).reshape(3, -1).T - 0.25
     free = lattice[np.sqrt((lattice**2).sum(axis=1)) > RADIUS + 0.025]
     cost = MedialCost(problem(KnownPoints(free=free, known=[[RADIUS, 0.0, 0.0]])))
@@ -247,16 +244,16 @@ def test_the_true_pose_among_balls_of_its_own_free_space_costs_almost_nothing() 
     np.testing.assert_allclose(ignored.evaluate(Poses.of(away)), 0.05**2, rtol=1e-9)
 
 
-def cost_problem(free: FloatArray) -> RegistrationProblem:
+def cost_problem(free):
     return problem(KnownPoints(free=free, known=[[RADIUS, 0.0, 0.0]]))
 
 
-def plain(generations: int) -> MedialConstraint:
+def plain(generations):
     cma_es = CmaEsSettings(generations=generations)
     return MedialConstraint(replace(preset_settings("medial_constraint"), cma_es=cma_es))
 
 
-def test_a_run_from_every_start_is_traced_to_its_end() -> None:
+def test_a_run_from_every_start_is_traced_to_its_end():
     method, watcher = plain(120), Watcher(snapshot_interval=5)
     method.register(posed(method), watcher)
     shown = [(stage, n, vectors.shape, len(cost)) for stage, n, vectors, cost in watcher.traces]
@@ -265,7 +262,7 @@ def test_a_run_from_every_start_is_traced_to_its_end() -> None:
     assert watcher.archives == []
 
 
-def test_the_search_only_lowers_the_best_cost_of_cma_es() -> None:
+def test_the_search_only_lowers_the_best_cost_of_cma_es():
     settings = preset_settings("medial_constraint_cma_me")
     method = MedialConstraintCmaMe(
         replace(settings, cma_es=replace(settings.cma_es, generations=12))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any
@@ -57,9 +57,7 @@ REFUSED: list[tuple[type[Any], dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("settings", "changes", "message"), REFUSED)
-def test_values_out_of_bounds_are_refused(
-    settings: type[Any], changes: dict[str, Any], message: str
-) -> None:
+def test_values_out_of_bounds_are_refused(settings, changes, message):
     with pytest.raises(SettingError, match=message) as caught:
         settings(**changes)
     assert "accepted: " in str(caught.value)
@@ -67,14 +65,14 @@ def test_values_out_of_bounds_are_refused(
 
 
 @pytest.mark.parametrize("name", ["anchored", "chsel", "medial_constraint_cma_me"])
-def test_a_measure_that_does_not_fit_the_space_is_refused(name: str) -> None:
+def test_a_measure_that_does_not_fit_the_space_is_refused(name):
     method = build_method(name, {"archive": {"measure": "plane_angle"}})
     with pytest.raises(SettingError, match="plane_angle exists only with plane"):
         method.register(posed(method))
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_class_defaults_are_the_default_preset(name: str) -> None:
+def test_class_defaults_are_the_default_preset(name):
     settings = preset_settings(name)
     variant = {"chsel_cma_me": {"search": "cma_me"}, "cvo_no_free_space": {"free_space": False}}
     assert settings == replace(type(settings)(), **variant.get(name, {}))
@@ -82,7 +80,7 @@ def test_class_defaults_are_the_default_preset(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_one_setting_changes_and_nothing_else(name: str) -> None:
+def test_one_setting_changes_and_nothing_else(name):
     """Also one of a group, whose other settings have another default in the group's own class."""
     before = settings_mapping(preset_settings(name))
     paths = list(_paths(before))
@@ -105,7 +103,7 @@ def test_one_setting_changes_and_nothing_else(name: str) -> None:
         assert settings_mapping(build_method(name, changes).settings) == expected, path
 
 
-def test_a_preset_names_what_differs_alone() -> None:
+def test_a_preset_names_what_differs_alone():
     for name in OURS:
         if name == "medial_constraint_cma_me":  # of CHSEL's presets; its defaults are its own
             continue
@@ -120,7 +118,7 @@ def test_a_preset_names_what_differs_alone() -> None:
                 assert here != ours, f"{name}, {preset}: {path}"
 
 
-def _paths(settings: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+def _paths(settings):
     """The paths of all settings that are no groups."""
     for name, value in settings.items():
         if isinstance(value, Mapping) and value:
@@ -129,10 +127,10 @@ def _paths(settings: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
             yield (name,)
 
 
-def test_an_installed_class_may_give_the_settings_of_each_preset() -> None:
+def test_an_installed_class_may_give_the_settings_of_each_preset():
     class Theirs(Icp):
         @staticmethod
-        def preset(name: str) -> IcpSettings:
+        def preset(name):
             return IcpSettings(iterations=PRESETS.index(name) + 7)
 
     theirs = {"theirs": (Theirs, IcpSettings())}

@@ -1,7 +1,5 @@
 """What every method keeps to, whatever it searches with."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -12,14 +10,12 @@ from chsel.cost.torch_cost import RelaxedCost
 from chsel.errors import ChselError
 from chsel.methods import METHODS, build_method, preset_settings
 from chsel.methods.medial_constraint import MedialCost, MedialCostSettings
-from chsel.methods.method import Method
-from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, check_rigid, inverse
-from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import PRESETS, settings_mapping
 from chsel.problem.streams import StreamKey
@@ -50,7 +46,7 @@ BOUNDED = ("anchored", "cvo", "cvo_no_free_space")
 """Methods of which no cost is too large for a number."""
 
 
-def quick(name: str, preset: str = "default", **changes: object) -> Method:
+def quick(name, preset="default", **changes):
     settings = settings_mapping(preset_settings(name, preset))
     for group in QUICK.keys() & settings.keys():
         settings[group] |= QUICK[group]
@@ -61,7 +57,7 @@ def quick(name: str, preset: str = "default", **changes: object) -> Method:
     return build_method(name, settings | changes)
 
 
-def judged(method: Method, problem: RegistrationProblem, poses: FloatArray) -> FloatArray | None:
+def judged(method, problem, poses):
     """Costs of poses by code of its own, for methods whose cost has some."""
     cost = getattr(method.settings, "cost", None)
     if isinstance(cost, CostSettings):
@@ -71,7 +67,7 @@ def judged(method: Method, problem: RegistrationProblem, poses: FloatArray) -> F
     return None
 
 
-def assert_whole(found: Hypotheses, count: int) -> None:
+def assert_whole(found, count):
     """As many rigid poses as E_0 has, by their cost."""
     assert found.object_from_world.shape == (count, 4, 4)
     check_rigid("hypotheses", found.object_from_world)
@@ -79,14 +75,14 @@ def assert_whole(found: Hypotheses, count: int) -> None:
     assert (np.diff(found.cost) >= 0.0).all()
 
 
-def assert_found(found: Hypotheses, truth: FloatArray, within: float = 0.005) -> None:
+def assert_found(found, truth, within=0.005):
     position, rotation = pose_errors(found.object_from_world[:1], truth, ObjectSymmetry())
     assert position[0] < within
     assert rotation[0] < 0.05
 
 
 @pytest.mark.parametrize("name", sorted({*METHODS} - {*WITH_STARTS_NEARBY}))
-def test_a_method_finds_the_pose_of_an_object_touched_all_over(name: str) -> None:
+def test_a_method_finds_the_pose_of_an_object_touched_all_over(name):
     method = build_method(name)
     problem = posed(method, known_points(TRUTH, 60), key=StreamKey(0, 0))
     assert_found(method.register(problem), TRUTH)
@@ -94,9 +90,7 @@ def test_a_method_finds_the_pose_of_an_object_touched_all_over(name: str) -> Non
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", METHODS)
-def test_results_are_whole_and_neither_observers_nor_threads_change_a_bit(
-    name: str, preset: str
-) -> None:
+def test_results_are_whole_and_neither_observers_nor_threads_change_a_bit(name, preset):
     method = quick(name, preset)
     problem = posed(method, FEW)
     found = method.register(problem)
@@ -112,7 +106,7 @@ def test_results_are_whole_and_neither_observers_nor_threads_change_a_bit(
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", METHODS)
-def test_one_hypothesis_is_enough(name: str, preset: str) -> None:
+def test_one_hypothesis_is_enough(name, preset):
     method = quick(name, preset)
     problem = posed(method, FEW)
     assert_whole(method.register(replace(problem, initial_set=problem.initial_set[:1])), 1)
@@ -120,7 +114,7 @@ def test_one_hypothesis_is_enough(name: str, preset: str) -> None:
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", [name for name in METHODS if name != "anchored"])
-def test_odd_points_have_results(name: str, preset: str) -> None:
+def test_odd_points_have_results(name, preset):
     method = quick(name, preset)
     cost = getattr(method.settings, "cost", None)
     for points_name, points in ODD.items():
@@ -132,7 +126,7 @@ def test_odd_points_have_results(name: str, preset: str) -> None:
             assert ((found.cost > -2e-3) & (found.cost <= 1.0)).all()
 
 
-def test_a_point_far_outside_of_the_workspace_costs_its_distance() -> None:
+def test_a_point_far_outside_of_the_workspace_costs_its_distance():
     method = quick("chsel")
     found = method.register(posed(method, KnownPoints(known=[[1e6, 0.0, 0.0]])))
     assert found.cost[0] == pytest.approx(1e6, rel=1e-4)
@@ -141,7 +135,7 @@ def test_a_point_far_outside_of_the_workspace_costs_its_distance() -> None:
 @pytest.mark.filterwarnings("ignore:invalid value encountered")
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", [name for name in METHODS if name not in BOUNDED])
-def test_costs_beyond_all_numbers_are_an_error_that_says_so(name: str, preset: str) -> None:
+def test_costs_beyond_all_numbers_are_an_error_that_says_so(name, preset):
     changes = {}
     if name in RELAXED:
         cost = settings_mapping(preset_settings(name, preset))["cost"]
@@ -157,7 +151,7 @@ def test_costs_beyond_all_numbers_are_an_error_that_says_so(name: str, preset: s
     [*((name, None) for name in PLANAR)]
     + [("chsel", measure) for measure in ("plane_position", "plane_angle", "object_xy")],
 )
-def test_on_a_plane_every_hypothesis_stands_on_it(name: str, measure: str | None) -> None:
+def test_on_a_plane_every_hypothesis_stands_on_it(name, measure):
     settings = settings_mapping(preset_settings(name))
     settings["plane"] = {"plane_height": 0.3}
     if measure is not None:
@@ -175,7 +169,7 @@ def test_on_a_plane_every_hypothesis_stands_on_it(name: str, measure: str | None
         assert_found(found, STANDING, within=0.01)
 
 
-def test_a_whole_session_step_is_a_function_of_its_problem_alone() -> None:
+def test_a_whole_session_step_is_a_function_of_its_problem_alone():
     method = quick("chsel")
     first = method.register(posed(method, FEW))
     second = posed(method, FEW, first)
@@ -194,9 +188,7 @@ def test_a_whole_session_step_is_a_function_of_its_problem_alone() -> None:
 
 
 @pytest.mark.parametrize("name", WITH_ARCHIVE)
-def test_snapshots_of_the_archive_come_at_start_interval_and_end_and_only_improve(
-    name: str,
-) -> None:
+def test_snapshots_of_the_archive_come_at_start_interval_and_end_and_only_improve(name):
     watcher, method = Watcher(snapshot_interval=2), quick(name)
     found = method.register(posed(method, FEW), watcher)
     assert [archive.iteration for archive in watcher.archives] == [0, 2, 4, 6]
@@ -211,7 +203,7 @@ def test_snapshots_of_the_archive_come_at_start_interval_and_end_and_only_improv
 
 
 @pytest.mark.parametrize("name", WITH_ARCHIVE)
-def test_poses_of_the_low_cost_set_enter_the_archive(name: str) -> None:
+def test_poses_of_the_low_cost_set_enter_the_archive(name):
     method, truth = quick(name), inverse(TRUTH)[None]
     without, problem = posed(method, FEW), posed(method, FEW, low_cost_set=truth)
     cost = judged(method, problem, truth)
@@ -222,7 +214,7 @@ def test_poses_of_the_low_cost_set_enter_the_archive(name: str) -> None:
     assert len(posed(method, FEW, first).low_cost_set) == len(first.elites)
 
 
-def test_more_passes_do_not_worsen_the_best_cost() -> None:
+def test_more_passes_do_not_worsen_the_best_cost():
     problem = posed(quick("chsel"), FEW)
     costs = [quick("chsel", passes=passes).register(problem).cost[0] for passes in (1, 2, 3)]
     assert costs[1] <= costs[0] + 1e-12

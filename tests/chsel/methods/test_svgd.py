@@ -4,13 +4,11 @@ import numba
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from chsel import KnownPoints, RegistrationProblem, RelaxedCost
 from chsel.errors import SettingError
 from chsel.methods import svgd as kernels
 from chsel.methods.svgd import Particles, Svgd, SvgdSettings, direct, particles_at
-from chsel.numerics.arrays import FloatArray
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.poses import Poses, apply, inverse
@@ -32,13 +30,11 @@ ADAM = {"lr": 0.005, "betas": (0.9, 0.999), "eps": 1e-8}
 
 
 @numba.njit
-def _direct(particles, scale, median):  # type: ignore[no-untyped-def]
+def _direct(particles, scale, median):
     direct(particles, scale, median)
 
 
-def directions(
-    vectors: FloatArray, scores: FloatArray, scale: float = 0.01, *, median: bool = False
-) -> FloatArray:
+def directions(vectors, scores, scale=0.01, *, median=False):
     """phi (B, d) of particles (B, d) with gradients of log p (B, d)."""
     particles: Particles = particles_at(vectors)
     particles.scores[:] = scores
@@ -46,9 +42,7 @@ def directions(
     return particles.directions
 
 
-def directions_by_torch(
-    vectors: Tensor, scores: Tensor, scale: float, *, median: bool = False
-) -> Tensor:
+def directions_by_torch(vectors, scores, scale, *, median=False):
     """The same by a matrix product and the gradient of the summed kernel by its first argument."""
     vectors = vectors.detach().requires_grad_()
     squares = ((vectors[:, None] - vectors.detach()[None]) ** 2).sum(dim=2)
@@ -63,16 +57,14 @@ def directions_by_torch(
     return (kernel.detach() @ scores - pull) / count
 
 
-def free_points() -> FloatArray:
+def free_points():
     lattice = np.stack(np.meshgrid(*[np.arange(-0.1, 0.6, 0.05)] * 3, indexing="ij"), -1)
     free = lattice.reshape(-1, 3)
     distance, _ = BOX_GRID.at(apply(inverse(TRUTH), free))
     return free[distance > 0.01]
 
 
-def posed(
-    points: KnownPoints | None = None, initial_set: FloatArray | None = None
-) -> RegistrationProblem:
+def posed(points=None, initial_set=None):
     points = points or KnownPoints(free=free_points(), known=CONTACTS)
     initial_set = around_truth() if initial_set is None else initial_set
     return RegistrationProblem(BOX_GRID, points, initial_set, WORKSPACE, 0.05, StreamKey(5, 2))
@@ -80,7 +72,7 @@ def posed(
 
 @pytest.mark.parametrize("median", [False, True])
 @pytest.mark.parametrize("count", [2, 3, 4, 5, 30])
-def test_directions_are_those_of_torch(count: int, median: bool) -> None:
+def test_directions_are_those_of_torch(count, median):
     random = np.random.default_rng(count)
     vectors = random.standard_normal((count, 9))
     scores = 10.0 * random.standard_normal((count, 9))
@@ -93,7 +85,7 @@ def test_directions_are_those_of_torch(count: int, median: bool) -> None:
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 5, 8, 30])
-def test_the_median_is_that_of_numpy_whatever_the_order(count: int) -> None:
+def test_the_median_is_that_of_numpy_whatever_the_order(count):
     """Seen by the direction of two close particles among `count` whose scores are zero."""
     random = np.random.default_rng(count)
     for _ in range(20):
@@ -108,7 +100,7 @@ def test_the_median_is_that_of_numpy_whatever_the_order(count: int) -> None:
         np.testing.assert_allclose(ours, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_on_a_flat_target_two_particles_part_along_their_difference() -> None:
+def test_on_a_flat_target_two_particles_part_along_their_difference():
     h = 0.01
     vectors = np.zeros((2, 9))
     vectors[1, [0, 7]] = 0.006, -0.008
@@ -120,14 +112,14 @@ def test_on_a_flat_target_two_particles_part_along_their_difference() -> None:
 
 
 @pytest.mark.parametrize("kernel", ["reference", "median"])
-def test_particles_move_as_torch_would_move_them(kernel: str) -> None:
+def test_particles_move_as_torch_would_move_them(kernel):
     problem = posed(initial_set=around_truth(6, 0.02, 0.002))
     settings = SvgdSettings(kernel=kernel, scale=0.05, iterations=60)
     kept = Watcher()
     Svgd(settings).register(problem, kept)
     cost, space = RelaxedCost.of(problem, settings.cost), SE3Space()
     vectors = torch.from_numpy(Poses.of(problem.initial_set).vectors.copy()).requires_grad_()
-    adam = torch.optim.Adam([vectors], **ADAM)  # type: ignore[arg-type]
+    adam = torch.optim.Adam([vectors], **ADAM)
     for iteration in range(60):
         if iteration == kept.iterations[1] == 50:
             np.testing.assert_allclose(kept.traces[1].vectors, vectors.detach(), atol=1e-8)
@@ -140,7 +132,7 @@ def test_particles_move_as_torch_would_move_them(kernel: str) -> None:
     np.testing.assert_allclose(kept.traces[2].vectors, vectors.detach(), atol=1e-8)
 
 
-def test_the_object_is_found_where_it_was_touched_all_over() -> None:
+def test_the_object_is_found_where_it_was_touched_all_over():
     problem = posed()
     found = Svgd().register(problem)
     position, rotation = pose_errors(found.object_from_world, TRUTH, ObjectSymmetry())
@@ -153,7 +145,7 @@ def test_the_object_is_found_where_it_was_touched_all_over() -> None:
     assert found.archive is None
 
 
-def test_a_kernel_of_wide_reach_keeps_particles_apart() -> None:
+def test_a_kernel_of_wide_reach_keeps_particles_apart():
     problem = posed(initial_set=around_truth(8, 0.01, 0.001))
     spreads = [
         Svgd(SvgdSettings(scale=scale))
@@ -166,13 +158,13 @@ def test_a_kernel_of_wide_reach_keeps_particles_apart() -> None:
     assert spreads[1] > spreads[0] + 0.001
 
 
-def test_a_particle_need_not_remember_what_is_around_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_particle_need_not_remember_what_is_around_it(monkeypatch):
     problem = posed()
     first = Svgd().register(problem).digest
     monkeypatch.setattr(kernels, "_MOST_REMEMBERED", 0)
     assert Svgd().register(problem).digest == first
 
 
-def test_more_particles_than_pairs_can_be_held_of_are_one_clear_error() -> None:
+def test_more_particles_than_pairs_can_be_held_of_are_one_clear_error():
     with pytest.raises(SettingError, match="number of poses in E_0 is 10001; accepted: at most"):
         Svgd().register(posed(initial_set=np.tile(np.eye(4), (10_001, 1, 1))))

@@ -1,13 +1,9 @@
 """Walks of poses: down to a floor, and among the likely ones below it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from chsel.methods.anchored.energy import Energy
-from chsel.methods.anchored.walking import Chains, stride_of, walked
-from chsel.numerics.arrays import FloatArray
+from chsel.methods.anchored.walking import stride_of, walked
 from chsel.problem.noise import LEVELS, NoiseModel, noise_model
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, inverse
@@ -34,27 +30,18 @@ AROUND = KnownPoints(
 )
 
 
-def chains_of(
-    energy: Energy,
-    poses: Poses,
-    floor: float,
-    moves: int,
-    kept: int = 0,
-    plane: PlaneSettings | None = None,
-) -> Chains:
+def chains_of(energy, poses, floor, moves, kept=0, plane=None):
     space, stream = search_space(plane, BOX_GRID), StreamKey(5, 2).kernel_stream(Purpose.WALKS, 3)
     stride = stride_of(space, object_centre(BOX_GRID), origin_bounds(WORKSPACE, space, 0.15))
     return walked(energy, stride, poses, energy.of(poses), floor, moves, stream, kept)
 
 
-def repeated(world_from_object: FloatArray, count: int) -> Poses:
+def repeated(world_from_object, count):
     return Poses.of(np.tile(inverse(world_from_object), (count, 1, 1)))
 
 
 @pytest.mark.parametrize(("plane", "dimension", "contacts"), [(None, 6, 60), (PLANE, 3, 24)])
-def test_kept_states_are_drawn_from_the_likelihood(
-    plane: PlaneSettings | None, dimension: int, contacts: int
-) -> None:
+def test_kept_states_are_drawn_from_the_likelihood(plane, dimension, contacts):
     """Of a normal distribution in d dimensions, energies are d / 2 above the least on average."""
     truth = TRUTH if plane is None else STANDING
     energy = energy_of(KnownPoints(known=apply(truth, on_faces(contacts))), NORMAL)
@@ -68,7 +55,7 @@ def test_kept_states_are_drawn_from_the_likelihood(
 
 
 @pytest.mark.parametrize("points", [AROUND, KnownPoints(known=AROUND.known[:2])])
-def test_energies_that_walks_carry_along_are_those_of_their_poses(points: KnownPoints) -> None:
+def test_energies_that_walks_carry_along_are_those_of_their_poses(points):
     """Walks gather free points once for many moves. None ends above the floor, or out of bounds."""
     energy = energy_of(points, noise_model(0.0005))
     starts = repeated(TRUTH, 12)
@@ -88,7 +75,7 @@ def test_energies_that_walks_carry_along_are_those_of_their_poses(points: KnownP
     assert np.abs(chains.kept - starts.numbers[:1]).max(axis=(0, 2)).min() > 1e-3
 
 
-def test_walks_from_above_come_down_to_a_floor_and_stop() -> None:
+def test_walks_from_above_come_down_to_a_floor_and_stop():
     energy, starts = energy_of(AROUND, noise_model(0.0005)), poses_around_truth(12, 0.02, 0.2)
     before = energy.of(starts)
     floor = float(np.sort(before)[3])

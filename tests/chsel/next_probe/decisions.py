@@ -1,17 +1,13 @@
 """Decision problems that tests share: a ball, a hand, actions from around it."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
 import trimesh
 
 from chsel.next_probe.decision_problem import Actions, Belief, DecisionProblem, HandShape
-from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import compose
-from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from tests.chsel.samples import ball_grid
 
@@ -20,14 +16,14 @@ WORKSPACE = Workspace((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3))
 
 
 @cache
-def box_hand() -> HandShape:
+def box_hand():
     """A box of 4 cm by 2 cm, which ends at the origin of the hand."""
     box = trimesh.creation.box((0.04, 0.02, 0.1))
     box.apply_translation((0.0, 0.0, -0.05))
     return HandShape.of(box)
 
 
-def facing(start: FloatArray, ahead: FloatArray) -> FloatArray:
+def facing(start, ahead):
     """Where a hand is, world_from_hand (4, 4), that starts at (3,) and moves along (3,)."""
     z = np.asarray(ahead, dtype=np.float64) / np.linalg.norm(ahead)
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
@@ -35,27 +31,18 @@ def facing(start: FloatArray, ahead: FloatArray) -> FloatArray:
     return compose(np.stack([x, np.cross(z, x), z], axis=1), np.asarray(start, dtype=np.float64))
 
 
-def along_x(places: list[tuple[float, float]], length: float = 0.6) -> Actions:
+def along_x(places, length=0.6):
     """Actions in +x from x = -0.3 at some y and z."""
     poses = np.array([facing(np.array([-0.3, y, z]), np.array([1.0, 0.0, 0.0])) for y, z in places])
     return Actions(poses, np.full(len(places), length))
 
 
-def at(*centres: tuple[float, float, float]) -> FloatArray:
+def at(*centres):
     """Poses (K, 4, 4), object_from_world, with the object's origin at some places."""
     return compose(np.tile(np.eye(3), (len(centres), 1, 1)), -np.array(centres))
 
 
-def ball_problem(
-    poses: FloatArray,
-    actions: Actions,
-    *,
-    weights: FloatArray | None = None,
-    available: BoolArray | None = None,
-    points: KnownPoints | None = None,
-    step: int = 0,
-    seed: int = 7,
-) -> DecisionProblem:
+def ball_problem(poses, actions, *, weights=None, available=None, points=None, step=0, seed=7):
     """What to do about a ball that is in one of some poses."""
     if weights is None:
         weights = np.full(len(poses), 1.0 / len(poses))
@@ -75,6 +62,6 @@ def ball_problem(
 
 
 @cache
-def ball() -> SdfGrid:
+def ball():
     """The grid of the ball, 5 mm fine."""
     return ball_grid(RADIUS, 0.005, 14)

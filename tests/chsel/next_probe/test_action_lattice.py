@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,8 +11,7 @@ from chsel.next_probe.action_lattice import (
     around_actions,
     forward_actions,
 )
-from chsel.next_probe.decision_problem import Actions, HandShape
-from chsel.numerics.arrays import FloatArray
+from chsel.next_probe.decision_problem import HandShape
 from chsel.problem.points import Workspace
 
 # A box of 4 x 10 x 12 cm, its origin 2 cm from its back.
@@ -32,7 +29,7 @@ workspaces = st.builds(
 )  # fmt: skip
 
 
-def corners(actions: Actions, share: float) -> FloatArray:
+def corners(actions, share):
     """The hand's corners (A, 8, 3) in the world, a share of the way."""
     poses = actions.world_from_hand
     placed = np.einsum("aij,nj->ani", poses[:, :3, :3], CORNERS) + poses[:, None, :3, 3]
@@ -42,8 +39,8 @@ def corners(actions: Actions, share: float) -> FloatArray:
 @settings(deadline=None, max_examples=40)
 @given(workspaces, st.floats(0.02, 0.5), st.integers(6, 300))
 def test_actions_around_start_outside_cross_the_workspace_and_stay_above_the_floor(
-    workspace: Workspace, spacing: float, most: int
-) -> None:
+    workspace, spacing, most
+):
     try:
         actions = around_actions(ActionSettings(spacing=spacing, most=most), workspace, HAND)
     except SettingError:  # too low for the hand
@@ -65,7 +62,7 @@ def test_actions_around_start_outside_cross_the_workspace_and_stay_above_the_flo
     np.testing.assert_allclose(tips[~horizontal, 2], CLEARANCE, atol=1e-9)
 
 
-def test_each_direction_covers_the_workspace_with_no_gap_wider_than_a_spacing() -> None:
+def test_each_direction_covers_the_workspace_with_no_gap_wider_than_a_spacing():
     actions = around_actions(ActionSettings(spacing=0.1), WORKSPACE, HAND)
     directions = actions.world_from_hand[:, :3, 2]
     views = np.unique(directions.round(6), axis=0)
@@ -83,7 +80,7 @@ def test_each_direction_covers_the_workspace_with_no_gap_wider_than_a_spacing() 
             assert high - nodes[-1] < 0.1
 
 
-def test_lattices_of_opposite_sides_are_half_a_spacing_apart() -> None:
+def test_lattices_of_opposite_sides_are_half_a_spacing_apart():
     actions = around_actions(ActionSettings(spacing=0.1), WORKSPACE, HAND)
     starts, directions = actions.world_from_hand[:, :3, 3], actions.world_from_hand[:, :3, 2]
     for along, across in ((0, 1), (1, 0)):
@@ -91,7 +88,7 @@ def test_lattices_of_opposite_sides_are_half_a_spacing_apart() -> None:
         assert (first - second) / 0.1 % 1.0 == pytest.approx(0.5, abs=1e-9)
 
 
-def test_a_forward_lattice_keeps_its_start_and_length() -> None:
+def test_a_forward_lattice_keeps_its_start_and_length():
     settings = ActionSettings(speed=0.1, setup=2.0)
     actions = forward_actions(settings, WORKSPACE, HAND, FORWARD, start=-0.05, length=0.3)
     assert len(actions) == 12 * 12
@@ -103,7 +100,7 @@ def test_a_forward_lattice_keeps_its_start_and_length() -> None:
 
 
 @pytest.mark.parametrize("radius", [0.3, 0.6, 0.9])
-def test_the_hand_stays_within_its_reach(radius: float) -> None:
+def test_the_hand_stays_within_its_reach(radius):
     reach = ReachBall((-0.2, 0.1, 0.2), radius)
     every = around_actions(ActionSettings(), WORKSPACE, HAND)
     actions = around_actions(ActionSettings(reach=reach), WORKSPACE, HAND)
@@ -114,7 +111,7 @@ def test_the_hand_stays_within_its_reach(radius: float) -> None:
         assert np.sqrt((away**2).sum(axis=1)).max() <= radius + 1e-9
 
 
-def test_a_reach_or_workspace_without_any_action_is_an_error() -> None:
+def test_a_reach_or_workspace_without_any_action_is_an_error():
     nowhere = ActionSettings(reach=ReachBall((9.0, 0.0, 0.0), 1.0))
     with pytest.raises(SettingError, match="leaves no action; accepted: a workspace above"):
         around_actions(nowhere, WORKSPACE, HAND)
@@ -123,6 +120,6 @@ def test_a_reach_or_workspace_without_any_action_is_an_error() -> None:
         around_actions(ActionSettings(), cellar, HAND)
 
 
-def test_a_tiny_spacing_costs_no_more_than_what_is_offered() -> None:
+def test_a_tiny_spacing_costs_no_more_than_what_is_offered():
     actions = around_actions(ActionSettings(spacing=1e-9, most=2_000), WORKSPACE, HAND)
     assert 1_800 < len(actions) <= 2_000

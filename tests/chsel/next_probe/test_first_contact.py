@@ -1,14 +1,11 @@
 """Where a hand meets an object: against exact first contacts of two meshes, and closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
-from chsel.next_probe.decision_problem import Actions, Belief, HandShape
+from chsel.next_probe.decision_problem import Actions, Belief
 from chsel.next_probe.first_contact import first_contacts, touched_points
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse, random_rotations
 from chsel.problem.sdf_grid import SdfGrid
 from runners.objects.loader import load_model
@@ -22,7 +19,7 @@ _SCALE = 2.5  # of the objects of simulated sessions
 _WAY = 0.8  # metres
 
 
-def exactly(engine: KinematicEngine, world_from_hand: FloatArray) -> tuple[float, FloatArray]:
+def exactly(engine, world_from_hand):
     """The way to the first contact of the meshes, and its place; inf and NaN if there is none."""
     start, ahead = world_from_hand[:3, 3], world_from_hand[:3, 2]
     assert engine.place(world_from_hand)
@@ -34,7 +31,7 @@ def exactly(engine: KinematicEngine, world_from_hand: FloatArray) -> tuple[float
 
 
 @pytest.mark.parametrize("name", ["drill", "cracker_box", "clamp"])
-def test_first_contacts_are_those_of_the_meshes(name: str) -> None:
+def test_first_contacts_are_those_of_the_meshes(name):
     mesh = load_model(name).apply_scale(_SCALE)
     stream = np.random.default_rng(2)
     world_from_object = compose(random_rotations(stream, 1)[0], np.array([0.3, 0.1, 0.2]))
@@ -62,7 +59,7 @@ def test_first_contacts_are_those_of_the_meshes(name: str) -> None:
 
 
 @pytest.mark.parametrize("ahead", [(1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.6, -0.48, 0.64)])
-def test_a_flat_hand_meets_a_ball_at_its_nearest_point(ahead: tuple[float, ...]) -> None:
+def test_a_flat_hand_meets_a_ball_at_its_nearest_point(ahead):
     centre, ahead = np.array([0.2, -0.1, 0.3]), np.array(ahead)
     starts = [centre - distance * ahead for distance in (0.3, 0.07, 0.02, 0.6, -0.3)]
     actions = Actions(np.array([facing(start, ahead) for start in starts]), np.full(5, 0.5))
@@ -75,7 +72,7 @@ def test_a_flat_hand_meets_a_ball_at_its_nearest_point(ahead: tuple[float, ...])
     assert not found.contact[0, ~met].any()
 
 
-def test_a_hand_that_passes_beside_the_object_misses_it() -> None:
+def test_a_hand_that_passes_beside_the_object_misses_it():
     edges = RADIUS + np.array([0.01, 0.02]) * [1.0, 1.0]  # half the hand across z and across y
     near, far = edges - 0.006, edges + 0.002
     wide_y = np.ptp(apply(along_x([(0.0, 0.0)]).world_from_hand[0], box_hand().vertices), axis=0)[1]
@@ -87,14 +84,12 @@ def test_a_hand_that_passes_beside_the_object_misses_it() -> None:
     assert np.isfinite(found.travel[0]).tolist() == [True, False, True, False]
 
 
-def by_definition(
-    sdf: SdfGrid, pose: FloatArray, world_from_hand: FloatArray, hand: HandShape
-) -> tuple[float, FloatArray]:
+def by_definition(sdf, pose, world_from_hand, hand):
     """The least way over the fine points around the three of the seen points that are met first."""
     surface, front = touched_points(sdf), hand.front
     hand_from_object = inverse(world_from_hand) @ inverse(pose)
 
-    def ways(points: FloatArray) -> FloatArray:
+    def ways(points):
         cells = np.floor((points[:, :2] - front.lower) / front.cell).astype(int)
         over = ((cells >= 0) & (cells < front.heights.shape)).all(axis=1)
         i, j = np.where(over[:, None], cells, 0).T
@@ -114,7 +109,7 @@ def by_definition(
     return ways(near)[least], apply(world_from_hand, near[least : least + 1])[0]
 
 
-def test_first_contacts_are_those_of_the_definition() -> None:
+def test_first_contacts_are_those_of_the_definition():
     stream, sdf = np.random.default_rng(8), SdfGrid.from_mesh(load_model("clamp"), 0.005)
     centre = sdf.bounds.mean(axis=0)
     pose = inverse(compose(random_rotations(stream, 1)[0], np.zeros(3)))
@@ -132,7 +127,7 @@ def test_first_contacts_are_those_of_the_definition() -> None:
         np.testing.assert_allclose(found.contact[0, n], place, rtol=0, atol=1e-12)
 
 
-def test_contacts_move_with_pose_and_hand() -> None:
+def test_contacts_move_with_pose_and_hand():
     stream = np.random.default_rng(4)
     world = compose(random_rotations(stream, 1)[0], np.array([0.1, -0.2, 0.3]))
     poses = at(*stream.uniform(-0.05, 0.05, (6, 3)).tolist())
@@ -146,7 +141,7 @@ def test_contacts_move_with_pose_and_hand() -> None:
     assert np.median(np.linalg.norm(there.contact - expected, axis=-1)) < 0.004
 
 
-def test_threads_and_other_actions_change_no_bit(threads: int) -> None:
+def test_threads_and_other_actions_change_no_bit(threads):
     stream = np.random.default_rng(6)
     poses = at(*stream.uniform(-0.1, 0.1, (60, 3)).tolist())
     belief = Belief(poses, np.full(60, 1.0 / 60.0))

@@ -1,7 +1,5 @@
 """What actions are worth: bounds, closed forms, and what must not matter; and hostile problems."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -11,14 +9,12 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chsel.errors import ChselError, PoseError, SettingError
+from chsel.errors import PoseError, SettingError
 from chsel.next_probe.decision_problem import (
     Belief,
-    DecisionProblem,
     HandShape,
 )
 from chsel.next_probe.forecast import Forecast
-from chsel.numerics.arrays import FloatArray
 from chsel.policies import POLICIES, build_policy
 from chsel.problem.points import KnownPoints
 from tests.chsel.next_probe.decisions import RADIUS, along_x, at, ball_problem, box_hand
@@ -27,7 +23,7 @@ NOISE = 0.005
 PLACES = [(0.0, 0.0), (0.06, 0.0), (-0.05, 0.03), (0.0, -0.1), (0.28, 0.28)]
 
 
-def some_problem(seed: int, count: int, reach: float) -> DecisionProblem:
+def some_problem(seed, count, reach):
     """Poses around the middle of the workspace, some of weight 0."""
     stream = np.random.default_rng(seed)
     poses = at(*stream.uniform(-reach, reach, (count, 3)).tolist())
@@ -35,7 +31,7 @@ def some_problem(seed: int, count: int, reach: float) -> DecisionProblem:
     return ball_problem(poses, along_x(PLACES), weights=weights / weights.sum())
 
 
-def entropy(weights: FloatArray) -> float:
+def entropy(weights):
     """Of a distribution, nats."""
     weights = weights[weights > 0.0]
     return float(-(weights * np.log(weights)).sum())
@@ -43,7 +39,7 @@ def entropy(weights: FloatArray) -> float:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 25), st.sampled_from([0.0, 0.003, 0.03, 0.15]))
-def test_gains_stay_within_their_bounds(seed: int, count: int, reach: float) -> None:
+def test_gains_stay_within_their_bounds(seed, count, reach):
     forecast = Forecast(some_problem(seed, count, reach), NOISE)
     weights, gains = forecast.problem.belief.weights, forecast.gains
     assert (gains.information >= 0.0).all()
@@ -60,7 +56,7 @@ def test_gains_stay_within_their_bounds(seed: int, count: int, reach: float) -> 
 
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10**6))
-def test_the_order_of_poses_and_those_without_weight_do_not_matter(seed: int) -> None:
+def test_the_order_of_poses_and_those_without_weight_do_not_matter(seed):
     problem = some_problem(seed, 12, 0.05)
     order = np.random.default_rng(seed).permutation(12)
     belief = problem.belief
@@ -73,7 +69,7 @@ def test_the_order_of_poses_and_those_without_weight_do_not_matter(seed: int) ->
     assert there.gains.expected_spread == pytest.approx(here.gains.expected_spread, abs=1e-9)
 
 
-def test_the_spread_is_the_root_mean_square_distance_of_surfaces() -> None:
+def test_the_spread_is_the_root_mean_square_distance_of_surfaces():
     """Of two balls of radius r, d apart: the mean square of |r - |x + d|| over |x| = r."""
     apart, weight = 0.02, 0.25
     cosines = np.linspace(-1.0, 1.0, 20_001)
@@ -87,7 +83,7 @@ def test_the_spread_is_the_root_mean_square_distance_of_surfaces() -> None:
     assert decision.expected_spread == pytest.approx([decision.spread])
 
 
-def test_information_is_that_of_the_formula() -> None:
+def test_information_is_that_of_the_formula():
     problem = some_problem(3, 10, 0.06)
     first, weights = Forecast(problem, NOISE).first, problem.belief.weights
     hit = np.isfinite(first.travel)
@@ -110,7 +106,7 @@ def test_information_is_that_of_the_formula() -> None:
 
 
 @pytest.mark.parametrize("weight", [0.5, 0.9, 1.0])
-def test_two_poses_that_an_outcome_splits(weight: float) -> None:
+def test_two_poses_that_an_outcome_splits(weight):
     poses = at((0.0, -0.2, 0.0), (0.0, 0.2, 0.0))
     weights = np.array([weight, 1.0 - weight])
     problem = ball_problem(poses, along_x([(0.2, 0.0)]), weights=weights)
@@ -123,13 +119,13 @@ def test_two_poses_that_an_outcome_splits(weight: float) -> None:
     assert forecast.gains.surviving == pytest.approx([(weights**2).sum()], abs=1e-4)
 
 
-def test_a_start_behind_the_object_is_blocked() -> None:
+def test_a_start_behind_the_object_is_blocked():
     problem = ball_problem(at((-0.35, 0.0, 0.0), (0.1, 0.0, 0.0)), along_x([(0.0, 0.0)]))
     assert Forecast(problem, NOISE).blocked_chance == pytest.approx([0.5])
     assert build_policy("information").decide(problem).stop == "actions"
 
 
-def finely_made_hand() -> HandShape:
+def finely_made_hand():
     """A hand of more than 80 000 faces."""
     ball = trimesh.creation.icosphere(subdivisions=6, radius=0.04)
     return HandShape.of(ball)
@@ -137,7 +133,7 @@ def finely_made_hand() -> HandShape:
 
 @pytest.mark.parametrize("name", POLICIES)
 @pytest.mark.parametrize("case", ["one pose", "one action", "no action left", "large", "fine hand"])
-def test_problems_of_any_size_are_decided(name: str, case: str) -> None:
+def test_problems_of_any_size_are_decided(name, case):
     stream = np.random.default_rng(1)
     problem = some_problem(1, 20, 0.1)
     if case == "one pose":
@@ -173,14 +169,14 @@ def test_problems_of_any_size_are_decided(name: str, case: str) -> None:
         (lambda: replace(some_problem(1, 2, 0.1), free_resolution=0.0), SettingError, "free_res"),
     ],
 )
-def test_what_is_no_problem_is_refused(make: object, error: type[ChselError], message: str) -> None:
+def test_what_is_no_problem_is_refused(make, error, message):
     with pytest.raises(error) as caught:
-        make()  # type: ignore[operator]
+        make()
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_hand_of_one_flat_face_still_touches() -> None:
+def test_a_hand_of_one_flat_face_still_touches():
     sheet = HandShape([[-0.02, -0.01, 0.0], [0.02, -0.01, 0.0], [0.0, 0.02, 0.0]], [[0, 1, 2]])
     problem = replace(some_problem(1, 5, 0.01), hand=sheet)
     assert np.isfinite(Forecast(problem, NOISE).first.travel[:, 0]).all()

@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import apply, compose, random_rotations
 from chsel.problem.registration_problem import RegistrationProblem
@@ -18,12 +17,12 @@ WORKSPACE = Workspace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 RESOLUTION = 0.02
 
 
-def ball(radius: float = 0.1, resolution: float = RESOLUTION) -> SdfGrid:
+def ball(radius=0.1, resolution=RESOLUTION):
     """A ball around the origin."""
     return ball_grid(radius, resolution, int(np.ceil((radius + 0.05) / resolution)))
 
 
-def box(half: FloatArray, resolution: float = RESOLUTION) -> SdfGrid:
+def box(half, resolution=RESOLUTION):
     """A box around the origin; half (3,): of its sides."""
     counts = 2 * np.ceil((half + 0.06) / resolution).astype(int) + 1
     origin = -(counts // 2) * resolution
@@ -37,7 +36,7 @@ def box(half: FloatArray, resolution: float = RESOLUTION) -> SdfGrid:
     return SdfGrid(origin, resolution, values, np.moveaxis(gradient, 0, -1))
 
 
-def noise(stream: np.random.Generator) -> SdfGrid:
+def noise(stream):
     """Numbers that are no distance to anything, but for a border that is outside.
 
     On most faces of the border, gradients point out of it.
@@ -63,15 +62,13 @@ OBJECTS: dict[str, Callable[[np.random.Generator], SdfGrid]] = {
 }
 
 
-def scene(
-    stream: np.random.Generator, sdf: SdfGrid, *, far: float = 0.0
-) -> tuple[RegistrationProblem, FloatArray]:
+def scene(stream, sdf, *, far=0.0):
     """A problem with points of every class, and a pose (4, 4) for the truth; `far` off 0."""
     rotation = random_rotations(stream, 1)
     truth = compose(rotation, far + stream.uniform(-0.1, 0.1, (1, 3)))[0]
     middle, span = sdf.bounds.mean(axis=0), np.ptp(sdf.bounds, axis=0)
 
-    def around(count: int, size: float) -> FloatArray:
+    def around(count, size):
         return apply(truth, middle + stream.uniform(-size, size, (count, 3)) * span)
 
     free = around(int(stream.integers(0, 60)), 0.9)

@@ -1,20 +1,15 @@
 """Modes that the grid passes by, on a ball: three contacts leave it one place on either side."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from chsel.errors import SdfError, SettingError
-from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import (
-    PlausibleSet,
     load_plausible,
     plausible_set,
     save_plausible,
@@ -49,7 +44,7 @@ PLAIN = PlausibleSettings(
 SEARCH = replace(PLAIN, modes=ModeSearchSettings(starts=30))
 
 
-def touched_ball(free: FloatArray | None = None, seed: int = 7) -> RegistrationProblem:
+def touched_ball(free=None, seed=7):
     """A ball of radius 0.1 m around the origin, with three contacts 8 cm below its centre."""
     angles = np.arange(3) * (2.0 * np.pi / 3.0)
     ring = np.stack([0.06 * np.cos(angles), 0.06 * np.sin(angles), np.full(3, -0.08)], axis=1)
@@ -58,12 +53,12 @@ def touched_ball(free: FloatArray | None = None, seed: int = 7) -> RegistrationP
     return RegistrationProblem(ball(), points, start, WORKSPACE, 0.03, StreamKey(seed, 2))
 
 
-def below(found: PlausibleSet) -> FloatArray:
+def below(found):
     """The members (N, 4, 4) in the other mode."""
     return found.world_from_object[found.world_from_object[:, 2, 3] < -0.08]
 
 
-def test_a_mode_between_the_poses_of_the_grid_is_found_and_filled() -> None:
+def test_a_mode_between_the_poses_of_the_grid_is_found_and_filled():
     problem, truth = touched_ball(), np.eye(4)
     plain, found = (plausible_set(problem, truth, by) for by in (PLAIN, SEARCH))
     assert len(below(plain)) == 0
@@ -81,7 +76,7 @@ def test_a_mode_between_the_poses_of_the_grid_is_found_and_filled() -> None:
     assert found.local[found.world_from_object[:, 2, 3] < -0.08].all()
 
 
-def test_modes_are_far_from_all_members_and_from_each_other() -> None:
+def test_modes_are_far_from_all_members_and_from_each_other():
     """Two contacts leave the ball a circle of places, three of which are 8 mm from the grid's."""
     problem, truth = touched_ball(), np.eye(4)
     contacts = KnownPoints(known=[[0.06, 0.0, -0.08], [-0.06, 0.0, -0.08]])
@@ -99,7 +94,7 @@ def test_modes_are_far_from_all_members_and_from_each_other() -> None:
         assert np.sqrt((apart**2).mean(axis=1)).min() > 0.9 * 0.01  # the separation
 
 
-def test_steps_move_poses_and_turn_them_about_their_origins() -> None:
+def test_steps_move_poses_and_turn_them_about_their_origins():
     stream = np.random.default_rng(1)
     poses, shifts, turns = random_poses(stream, 20, 2.0), *stream.normal(size=(2, 20, 3))
     turns[7] = 0.0
@@ -109,7 +104,7 @@ def test_steps_move_poses_and_turn_them_about_their_origins() -> None:
     np.testing.assert_array_equal(found[:, :3, 3], poses[:, :3, 3] + shifts)
 
 
-def test_a_mode_that_is_ruled_out_is_not_found() -> None:
+def test_a_mode_that_is_ruled_out_is_not_found():
     """By one free point in it; or as it is farther outside of the grid than the separation."""
     seen_through = touched_ball(free=OTHER[None])
     assert len(below(plausible_set(seen_through, np.eye(4), SEARCH))) == 0
@@ -120,7 +115,7 @@ def test_a_mode_that_is_ruled_out_is_not_found() -> None:
     assert len(below(plausible_set(touched_ball(), np.eye(4), outside))) == 0
 
 
-def test_without_a_pose_to_climb_from_nothing_changes() -> None:
+def test_without_a_pose_to_climb_from_nothing_changes():
     by = replace(SEARCH, grid=replace(SEARCH.grid, offsets=FAR))
     plain = replace(by, modes=None)
     problem, truth = touched_ball(), np.eye(4)
@@ -129,7 +124,7 @@ def test_without_a_pose_to_climb_from_nothing_changes() -> None:
     assert found.digest == other.digest
 
 
-def test_points_that_its_neighbours_violate_do_not_hide_a_mode() -> None:
+def test_points_that_its_neighbours_violate_do_not_hide_a_mode():
     """A layer of free points around the other ball: the pose 8 mm off it is in some of them."""
     away = np.random.default_rng(0).normal(size=(300, 3))
     layer = OTHER + 0.105 * away / np.sqrt((away**2).sum(axis=1))[:, None]
@@ -145,14 +140,14 @@ def test_points_that_its_neighbours_violate_do_not_hide_a_mode() -> None:
     assert len(below(plausible_set(problem, np.eye(4), shallow))) == 0
 
 
-def test_the_search_depends_on_the_problem_and_the_seed_alone() -> None:
+def test_the_search_depends_on_the_problem_and_the_seed_alone():
     alone = plausible_set(touched_ball(), np.eye(4), SEARCH)
     with threads(2):
         assert plausible_set(touched_ball(), np.eye(4), SEARCH).digest == alone.digest
     assert plausible_set(touched_ball(seed=8), np.eye(4), SEARCH).digest != alone.digest
 
 
-def test_modes_take_the_places_of_others_where_there_are_too_many() -> None:
+def test_modes_take_the_places_of_others_where_there_are_too_many():
     """All 40 rotations of a ball are members; 10 are kept."""
     few = replace(SEARCH, members=10, fill_to=10)
     found = plausible_set(touched_ball(), np.eye(4), few)
@@ -162,7 +157,7 @@ def test_modes_take_the_places_of_others_where_there_are_too_many() -> None:
     np.testing.assert_array_equal(found.truth, np.eye(4))
 
 
-def test_settings_of_the_search_are_part_of_the_definition() -> None:
+def test_settings_of_the_search_are_part_of_the_definition():
     others = [SEARCH, replace(SEARCH, modes=ModeSearchSettings(31)), PLAIN]
     assert len({one.digest for one in others}) == 3
     assert build_settings(PlausibleSettings, settings_mapping(SEARCH), "definition") == SEARCH
@@ -170,7 +165,7 @@ def test_settings_of_the_search_are_part_of_the_definition() -> None:
     assert empty.modes == ModeSearchSettings()
 
 
-def test_a_set_with_modes_is_read_as_it_was_written(tmp_path: Path) -> None:
+def test_a_set_with_modes_is_read_as_it_was_written(tmp_path):
     problem, truth = touched_ball(), np.eye(4)
     found = plausible_set(problem, truth, SEARCH)
     save_plausible(tmp_path, found)
@@ -180,7 +175,7 @@ def test_a_set_with_modes_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert (read.digest, read.settings) == (found.digest, SEARCH)
 
 
-def test_an_object_without_a_surface_is_one_clear_error() -> None:
+def test_an_object_without_a_surface_is_one_clear_error():
     """All of the grid is outside, and the points are known to be, too."""
     problem = touched_ball()
     sdf, known = problem.sdf, problem.points.known
@@ -201,6 +196,6 @@ def test_an_object_without_a_surface_is_one_clear_error() -> None:
         ({"separations": 0.01}, "did you mean separation"),
     ],
 )
-def test_a_setting_that_cannot_be_is_named(values: dict[str, float], message: str) -> None:
+def test_a_setting_that_cannot_be_is_named(values, message):
     with pytest.raises(SettingError, match=message):
         build_settings(PlausibleSettings, {"modes": values}, "definition")

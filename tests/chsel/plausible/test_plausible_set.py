@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -50,7 +49,7 @@ MANY = PoseGridSettings(
 
 
 @st.composite
-def costs(draw: st.DrawFn) -> EvaluationCostSettings:
+def costs(draw):
     return EvaluationCostSettings(
         draw(st.sampled_from(["means", "sums"])),
         violation=draw(st.sampled_from([1e-3, 0.2, 1e5])),
@@ -61,9 +60,7 @@ def costs(draw: st.DrawFn) -> EvaluationCostSettings:
     )
 
 
-def brute_force(
-    problem: RegistrationProblem, poses: FloatArray, by: EvaluationCostSettings
-) -> FloatArray:
+def brute_force(problem, poses, by):
     """C (B,) of world_from_object poses (B, 4, 4), term by term as it is defined."""
     points, sdf = problem.points, problem.sdf
     known, free, occupied = [], [], []
@@ -92,14 +89,8 @@ def brute_force(
     value=st.sampled_from([None, 0.0, 0.02]),
 )
 def test_what_a_scan_finds_is_what_brute_force_finds_to_the_bit(
-    seed: int,
-    kind: str,
-    by: EvaluationCostSettings,
-    far: float,
-    share: float,
-    aligned: bool,
-    value: float | None,
-) -> None:
+    seed, kind, by, far, share, aligned, value
+):
     """Also where points lie on the borders of cells, if aligned; value: that of all points."""
     stream = np.random.default_rng(seed)
     problem, truth = scene(stream, OBJECTS[kind](stream), far=far)
@@ -127,7 +118,7 @@ def test_what_a_scan_finds_is_what_brute_force_finds_to_the_bit(
     np.testing.assert_array_equal(below, np.where(every < limit, every, np.inf))
 
 
-def touched_box(*, free: bool = True) -> tuple[RegistrationProblem, FloatArray]:
+def touched_box(*, free=True):
     """A box with contacts on five sides, in free space but for itself, or in the unknown."""
     half = np.array([0.06, 0.09, 0.12])
     problem, truth = scene(np.random.default_rng(3), box(half))
@@ -143,7 +134,7 @@ WIDE = replace(SMALL, rotations=300)
 BOX = PlausibleSettings(epsilon=0.01, cost=EvaluationCostSettings(lookup="trilinear"), grid=WIDE)
 
 
-def test_the_set_holds_the_true_pose_and_nothing_that_costs_more_than_epsilon_above_it() -> None:
+def test_the_set_holds_the_true_pose_and_nothing_that_costs_more_than_epsilon_above_it():
     problem, truth = touched_box()
     found = plausible_set(problem, truth, BOX)
     np.testing.assert_array_equal(found.truth, truth)
@@ -155,7 +146,7 @@ def test_the_set_holds_the_true_pose_and_nothing_that_costs_more_than_epsilon_ab
     assert len(found.index) == (~found.local).sum()  # the true pose itself is on this grid
 
 
-def test_a_thin_set_is_filled_too() -> None:
+def test_a_thin_set_is_filled_too():
     problem, truth = touched_box()
     by = replace(BOX, epsilon=0.0005, fill_to=300)
     found = plausible_set(problem, truth, by)
@@ -165,7 +156,7 @@ def test_a_thin_set_is_filled_too() -> None:
     assert len(np.unique(found.world_from_object.reshape(-1, 16), axis=0)) == by.fill_to
 
 
-def test_threads_change_nothing() -> None:
+def test_threads_change_nothing():
     problem, truth = touched_box()
     by = replace(BOX, grid=replace(SMALL, rotations=1000), epsilon=0.03)
     alone = plausible_set(problem, truth, by)
@@ -174,7 +165,7 @@ def test_threads_change_nothing() -> None:
         assert plausible_set(problem, truth, by).digest == alone.digest
 
 
-def test_the_set_shrinks_as_more_is_known_of_sums() -> None:
+def test_the_set_shrinks_as_more_is_known_of_sums():
     problem, truth = touched_box(free=False)
     by = replace(
         BOX, cost=replace(BOX.cost, combine="sums"), fill_to=0, epsilon=0.1, members=100_000
@@ -191,7 +182,7 @@ def test_the_set_shrinks_as_more_is_known_of_sums() -> None:
     assert sizes[0] > sizes[1] > sizes[2] > 0
 
 
-def test_a_symmetry_of_the_object_is_found() -> None:
+def test_a_symmetry_of_the_object_is_found():
     """A box turned by half a turn about an axis of its own is the same box."""
     problem, truth = touched_box()
     cost = EvaluationCost(problem, BOX.cost)
@@ -200,7 +191,7 @@ def test_a_symmetry_of_the_object_is_found() -> None:
     assert other == pytest.approx(one, abs=1e-3)
 
 
-def test_what_the_true_pose_violates_is_allowed_to_others() -> None:
+def test_what_the_true_pose_violates_is_allowed_to_others():
     problem, truth = touched_box()
     with_one = np.concatenate([problem.points.free, truth[None, :3, 3]])
     violated = replace(problem, points=replace(problem.points, free=with_one))
@@ -210,7 +201,7 @@ def test_what_the_true_pose_violates_is_allowed_to_others() -> None:
     assert len(lenient.index) >= len(strict.index) > 0
 
 
-def test_more_members_than_are_kept_are_a_random_subset_with_the_true_pose() -> None:
+def test_more_members_than_are_kept_are_a_random_subset_with_the_true_pose():
     problem, truth = touched_box(free=False)
     by = replace(BOX, epsilon=0.05, members=40)
     found = plausible_set(problem, truth, by)
@@ -222,14 +213,14 @@ def test_more_members_than_are_kept_are_a_random_subset_with_the_true_pose() -> 
     assert plausible_set(seeded, truth, by).digest != found.digest
 
 
-def test_the_rotations_are_the_same_at_every_step_of_a_session() -> None:
+def test_the_rotations_are_the_same_at_every_step_of_a_session():
     problem, truth = touched_box()
     later = replace(problem, key=StreamKey(7, 9))
     found = plausible_set(problem, truth, BOX)
     assert plausible_set(later, truth, BOX).digest == found.digest
 
 
-def test_too_many_members_are_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_members_are_one_clear_error(monkeypatch):
     monkeypatch.setattr(pose_scan, "MOST_MEMBERS", 10)
     problem, truth = touched_box()
     with pytest.raises(EvaluationError, match="more than 10 poses cost less than"):
@@ -248,9 +239,7 @@ def test_too_many_members_are_one_clear_error(monkeypatch: pytest.MonkeyPatch) -
     ids=["one contact", "one free point", "occupied alone", "collinear", "far away"],
 )
 @pytest.mark.parametrize("definition", ["default", "paper", "reference"])
-def test_degenerate_points_give_finite_costs_or_one_error(
-    points: KnownPoints, definition: str
-) -> None:
+def test_degenerate_points_give_finite_costs_or_one_error(points, definition):
     problem = RegistrationProblem(ball(), points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(0, 0))
     by = plausible_settings(definition, 0.001)
     by = replace(by, grid=replace(by.grid, offsets=SMALL.offsets, rotations=150))
@@ -260,7 +249,7 @@ def test_degenerate_points_give_finite_costs_or_one_error(
     assert len(found.cost) >= 1
 
 
-def test_the_definitions_have_the_grids_that_their_sources_name() -> None:
+def test_the_definitions_have_the_grids_that_their_sources_name():
     paper, reference, default = (
         plausible_settings(name, 0.001) for name in ("paper", "reference", "default")
     )
@@ -283,7 +272,7 @@ def test_the_definitions_have_the_grids_that_their_sources_name() -> None:
     assert (other_seed != grid.rotations).any()  # the function itself follows its seed
 
 
-def plausible_rotation(by: PlausibleSettings, seed: int) -> FloatArray:
+def plausible_rotation(by, seed):
     """The first random rotation that a problem of that seed looks at."""
     problem, truth = touched_box()
     problem = replace(problem, key=StreamKey(seed, 0))
@@ -301,12 +290,12 @@ def plausible_rotation(by: PlausibleSettings, seed: int) -> FloatArray:
         (lambda: plausible_settings("mine", 0.001), "'mine'"),
     ],
 )
-def test_a_setting_that_cannot_be_is_named(make: object, message: str) -> None:
+def test_a_setting_that_cannot_be_is_named(make, message):
     with pytest.raises(SettingError, match=message):
-        make()  # type: ignore[operator]
+        make()
 
 
-def test_a_true_pose_that_is_not_rigid_is_named() -> None:
+def test_a_true_pose_that_is_not_rigid_is_named():
     problem, truth = touched_box()
     with pytest.raises(PoseError, match="world_from_object"):
         plausible_set(problem, 2.0 * truth, BOX)
@@ -320,7 +309,7 @@ Made = tuple[RegistrationProblem, FloatArray, PlausibleSet]
 
 
 @pytest.fixture(scope="module")
-def made() -> Made:
+def made():
     problem, truth = scene(np.random.default_rng(1), ball())
     contact = apply(truth, np.array([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]))
     points = replace(problem.points, free=np.zeros((0, 3)), known=contact, known_sdf=None)
@@ -328,9 +317,7 @@ def made() -> Made:
     return problem, truth, plausible_set(problem, truth, SETTINGS)
 
 
-def test_a_set_is_read_as_it_was_written_and_named_by_its_points(
-    made: Made, tmp_path: Path
-) -> None:
+def test_a_set_is_read_as_it_was_written_and_named_by_its_points(made, tmp_path):
     problem, truth, found = made
     assert len(found.index) > 3
     assert load_plausible(tmp_path, problem, SETTINGS) is None
@@ -346,9 +333,7 @@ def test_a_set_is_read_as_it_was_written_and_named_by_its_points(
     np.testing.assert_array_equal(read.truth, truth)
 
 
-def test_other_points_definitions_and_seeds_have_files_of_their_own(
-    made: Made, tmp_path: Path
-) -> None:
+def test_other_points_definitions_and_seeds_have_files_of_their_own(made, tmp_path):
     problem, _, found = made
     path = save_plausible(tmp_path, found)
     more = replace(problem, points=problem.points.merged(problem.points))
@@ -366,7 +351,7 @@ def test_other_points_definitions_and_seeds_have_files_of_their_own(
     assert plausible_path(tmp_path, later, SETTINGS) == path
 
 
-def test_a_set_around_another_true_pose_is_refused(made: Made, tmp_path: Path) -> None:
+def test_a_set_around_another_true_pose_is_refused(made, tmp_path):
     problem, truth, found = made
     save_plausible(tmp_path, found)
     moved = truth.copy()
@@ -375,7 +360,7 @@ def test_a_set_around_another_true_pose_is_refused(made: Made, tmp_path: Path) -
         load_plausible(tmp_path, problem, SETTINGS, world_from_object=moved)
 
 
-def test_what_was_changed_after_it_was_written_is_refused(made: Made, tmp_path: Path) -> None:
+def test_what_was_changed_after_it_was_written_is_refused(made, tmp_path):
     problem, _, found = made
     path = save_plausible(tmp_path, found)
     with np.load(path) as archive:
@@ -390,7 +375,7 @@ def test_what_was_changed_after_it_was_written_is_refused(made: Made, tmp_path: 
             load_plausible(tmp_path, problem, SETTINGS)
 
 
-def test_a_folder_that_cannot_be_written_is_named(made: Made, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_named(made, tmp_path):
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(EvaluationError, match="cannot be written"):
         save_plausible(tmp_path / "file", made[2])

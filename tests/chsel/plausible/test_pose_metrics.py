@@ -1,12 +1,9 @@
 """Pose errors modulo symmetries, at the object's centre."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
 
-from chsel.numerics.arrays import FloatArray
 from chsel.plausible.pose_metrics import closest_pose, pose_errors, result_numbers
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.points import KnownPoints, Workspace
@@ -25,19 +22,19 @@ SYMMETRY = object_symmetry(BOX)
 X, Y, Z = np.eye(3)
 
 
-def about_centre(axis: FloatArray, angle: float, shift: FloatArray | None = None) -> FloatArray:
+def about_centre(axis, angle, shift=None):
     """A rigid motion (4, 4) of the object in its own frame: a rotation about its centre."""
     rotation = axis_angle(axis, np.array(angle))
     shift = np.zeros(3) if shift is None else shift
     return compose(rotation, CENTRE - rotation @ CENTRE + shift)
 
 
-def hypothesis(motion: FloatArray) -> FloatArray:
+def hypothesis(motion):
     """object_from_world (1, 4, 4) of the object moved before it is placed at the true pose."""
     return inverse(TRUTH @ motion)[None]
 
 
-def test_a_right_pose_turned_by_a_symmetry_has_no_error() -> None:
+def test_a_right_pose_turned_by_a_symmetry_has_no_error():
     motions = [about_centre(axis, np.pi) for axis in (X, Y, Z)]
     poses = np.concatenate([hypothesis(motion) for motion in motions])
     position, rotation = pose_errors(poses, TRUTH, SYMMETRY)
@@ -47,7 +44,7 @@ def test_a_right_pose_turned_by_a_symmetry_has_no_error() -> None:
     assert origins.min() > 0.5
 
 
-def test_errors_near_a_symmetric_pose_are_from_there() -> None:
+def test_errors_near_a_symmetric_pose_are_from_there():
     shift = np.array([0.003, 0.0, -0.004])
     tilt = about_centre(np.array([0.6, 0.8, 0.0]), 0.1, shift)
     for motion in (tilt, tilt @ about_centre(Z, np.pi), about_centre(X, np.pi) @ tilt):
@@ -56,7 +53,7 @@ def test_errors_near_a_symmetric_pose_are_from_there() -> None:
         np.testing.assert_allclose(rotation, 0.1, atol=1e-6)
 
 
-def test_half_way_between_two_symmetric_poses_the_error_is_largest() -> None:
+def test_half_way_between_two_symmetric_poses_the_error_is_largest():
     position, rotation = pose_errors(hypothesis(about_centre(Z, np.pi / 2)), TRUTH, SYMMETRY)
     assert position[0] == pytest.approx(0.0, abs=1e-9)
     assert rotation[0] == pytest.approx(np.pi / 2, abs=1e-6)
@@ -66,7 +63,7 @@ def test_half_way_between_two_symmetric_poses_the_error_is_largest() -> None:
     np.testing.assert_allclose(np.rad2deg(rotation), [80.0, 10.0, 10.0, 10.0], atol=1e-4)
 
 
-def test_a_mirror_image_is_not_a_symmetry() -> None:
+def test_a_mirror_image_is_not_a_symmetry():
     """A quarter turn of a box is an error, and so is half a turn of a drill."""
     drill = object_symmetry(load_model("drill"))
     turned = TRUTH @ compose(axis_angle(Z, np.array(np.pi)), np.zeros(3))
@@ -74,7 +71,7 @@ def test_a_mirror_image_is_not_a_symmetry() -> None:
     assert rotation[0] == pytest.approx(np.pi)
 
 
-def test_about_an_axis_of_revolution_any_angle_is_right() -> None:
+def test_about_an_axis_of_revolution_any_angle_is_right():
     can = trimesh.creation.cylinder(0.033, 0.1)
     can.apply_translation(CENTRE)
     symmetry = object_symmetry(can)
@@ -87,14 +84,14 @@ def test_about_an_axis_of_revolution_any_angle_is_right() -> None:
     np.testing.assert_allclose(rotation, [0.0, 0.0, 0.2, np.pi - 3.0], atol=1e-6)
 
 
-def problem_of(mesh: trimesh.Trimesh, poses: FloatArray) -> RegistrationProblem:
+def problem_of(mesh, poses):
     sdf = SdfGrid.from_mesh(mesh, 0.01)
     points = KnownPoints(known=[[0.0, 0.0, 0.0]], known_sdf=[0.0])
     workspace = Workspace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     return RegistrationProblem(sdf, points, poses, workspace, 0.01, StreamKey(0, 1))
 
 
-def test_numbers_of_a_result_are_modulo_symmetries_with_or_without_a_mesh() -> None:
+def test_numbers_of_a_result_are_modulo_symmetries_with_or_without_a_mesh():
     motions = [about_centre(Z, np.pi, np.array([0.0, 0.02, 0.0])), about_centre(X, 0.5)]
     motions += [about_centre(X, np.deg2rad(3.0), np.array([0.002, 0.0, 0.0]))]
     poses = np.concatenate([hypothesis(motion) for motion in motions])
@@ -111,7 +108,7 @@ def test_numbers_of_a_result_are_modulo_symmetries_with_or_without_a_mesh() -> N
     assert "best_position_error" not in result_numbers(found, problem, None, None)
 
 
-def test_the_closest_pose_is_that_of_the_closest_surface() -> None:
+def test_the_closest_pose_is_that_of_the_closest_surface():
     """Modulo symmetries, and whatever stands where no kernel can read."""
     sdf = SdfGrid.from_mesh(BOX, 0.01)
     motions = [about_centre(Z, 0.1), about_centre(Z, np.pi, np.array([0.001, 0.0, 0.0]))]

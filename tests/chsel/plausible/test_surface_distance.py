@@ -1,7 +1,5 @@
 """Distances between surfaces, plausible diversity and calibration, where the answer is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 import trimesh
 
 from chsel.errors import EvaluationError, PoseError, SettingError
-from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import cheapest, plausible_diversity, true_pose_rank
 from chsel.plausible.surface_distance import (
@@ -27,36 +24,32 @@ SIDES = np.array([0.08, 0.12, 0.2])
 
 
 @pytest.fixture(scope="module")
-def ball() -> tuple[SdfGrid, trimesh.Trimesh]:
+def ball():
     """A ball of radius 0.1 m, round to 5e-6 m."""
     mesh = trimesh.creation.icosphere(5, RADIUS)
     return SdfGrid.from_mesh(mesh, 0.005), mesh
 
 
 @pytest.fixture(scope="module")
-def box() -> tuple[SdfGrid, trimesh.Trimesh]:
+def box():
     mesh = trimesh.creation.box(SIDES)
     return SdfGrid.from_mesh(mesh, 0.005), mesh
 
 
-def distance_of(
-    thing: tuple[SdfGrid, trimesh.Trimesh], count: int = 200, **values: object
-) -> SurfaceDistance:
+def distance_of(thing, count=200, **values):
     sdf, mesh = thing
     by = replace(DistanceSettings(), **values)
     return SurfaceDistance(sdf, mesh, surface_points(mesh, count, StreamKey(0, 0)), by)
 
 
-def poses(seed: int, count: int, *, spread: float = 0.03, angle: float = 0.3) -> FloatArray:
+def poses(seed, count, *, spread=0.03, angle=0.3):
     stream = np.random.default_rng(seed)
     turns = rotation_vector(stream.normal(0.0, angle, (count, 3)))
     return compose(turns, stream.normal(0.0, spread, (count, 3)))
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_ball_may_turn_as_it_likes_and_a_shift_costs_a_third_of_its_square(
-    ball: tuple[SdfGrid, trimesh.Trimesh], method: str
-) -> None:
+def test_a_ball_may_turn_as_it_likes_and_a_shift_costs_a_third_of_its_square(ball, method):
     """For a shift t much less than the radius: | |r n + t| - r | = |n . t|, whose mean square
     over directions n is t^2 / 3."""
     distance = distance_of(ball, 4000, method=method)
@@ -73,9 +66,7 @@ def test_a_ball_may_turn_as_it_likes_and_a_shift_costs_a_third_of_its_square(
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_box_shifted_along_a_side_costs_what_its_faces_move(
-    box: tuple[SdfGrid, trimesh.Trimesh], method: str
-) -> None:
+def test_a_box_shifted_along_a_side_costs_what_its_faces_move(box, method):
     """For a shift d: one end comes out by d; the other goes in by d, but is nearer to a side in
     a frame of width d; the sides slide along themselves, but for a strip beyond the edge."""
     shift, count = 0.01, 20_000
@@ -89,7 +80,7 @@ def test_a_box_shifted_along_a_side_costs_what_its_faces_move(
     np.testing.assert_allclose(found, expected, rtol=0.03)
 
 
-def test_methods_agree_where_the_metrics_look(box: tuple[SdfGrid, trimesh.Trimesh]) -> None:
+def test_methods_agree_where_the_metrics_look(box):
     estimates, members = inverse(poses(1, 12)), poses(2, 25)
     exact = distance_of(box, method="exact").between(estimates, members)
     nearest = distance_of(box, method="nearest").between(estimates, members)
@@ -104,7 +95,7 @@ def test_methods_agree_where_the_metrics_look(box: tuple[SdfGrid, trimesh.Trimes
     assert exact[3, 4] == pytest.approx(1e6 * (signed**2).mean())
 
 
-def test_a_set_is_at_no_distance_from_itself(box: tuple[SdfGrid, trimesh.Trimesh]) -> None:
+def test_a_set_is_at_no_distance_from_itself(box):
     members = poses(3, 20)
     for method in ("exact", "nearest"):
         metrics = plausible_diversity(
@@ -114,7 +105,7 @@ def test_a_set_is_at_no_distance_from_itself(box: tuple[SdfGrid, trimesh.Trimesh
         assert metrics.root < 1e-7
 
 
-def test_coverage_and_plausibility_are_the_means_of_the_nearest() -> None:
+def test_coverage_and_plausibility_are_the_means_of_the_nearest():
     metrics = plausible_diversity(np.array([[1.0, 8.0, 3.0], [4.0, 5.0, 9.0]]))
     assert metrics.coverage == pytest.approx((1.0 + 5.0 + 3.0) / 3.0)
     assert metrics.plausibility == pytest.approx((1.0 + 4.0) / 2.0)
@@ -122,7 +113,7 @@ def test_coverage_and_plausibility_are_the_means_of_the_nearest() -> None:
     assert metrics.root == pytest.approx(5.5**0.5)
 
 
-def test_moving_everything_alike_changes_nothing(box: tuple[SdfGrid, trimesh.Trimesh]) -> None:
+def test_moving_everything_alike_changes_nothing(box):
     estimates, members = poses(8, 5), poses(9, 7)
     motion = compose(random_rotations(np.random.default_rng(10), 1), np.array([[0.5, -1.0, 2.0]]))
     distance = distance_of(box)
@@ -131,7 +122,7 @@ def test_moving_everything_alike_changes_nothing(box: tuple[SdfGrid, trimesh.Tri
     np.testing.assert_allclose(moved, still, rtol=1e-8)
 
 
-def test_threads_change_nothing(box: tuple[SdfGrid, trimesh.Trimesh]) -> None:
+def test_threads_change_nothing(box):
     distance = distance_of(box)
     estimates, members = inverse(poses(11, 9)), poses(12, 8)
     alone = distance.between(estimates, members)
@@ -139,9 +130,7 @@ def test_threads_change_nothing(box: tuple[SdfGrid, trimesh.Trimesh]) -> None:
         np.testing.assert_array_equal(distance.between(estimates, members), alone)
 
 
-def test_surface_points_lie_on_the_surface_and_are_uniform_by_area(
-    box: tuple[SdfGrid, trimesh.Trimesh],
-) -> None:
+def test_surface_points_lie_on_the_surface_and_are_uniform_by_area(box):
     points = surface_points(box[1], 20_000, StreamKey(4, 0))
     assert np.abs(mesh_sdf(box[1], points)[0]).max() < 1e-12
     a, b, c = SIDES
@@ -151,7 +140,7 @@ def test_surface_points_lie_on_the_surface_and_are_uniform_by_area(
     assert (points != surface_points(box[1], 20_000, StreamKey(5, 0))).any()
 
 
-def test_the_cheapest_share_of_hypotheses_is_told_by_cost() -> None:
+def test_the_cheapest_share_of_hypotheses_is_told_by_cost():
     costs = np.array([4.0, 1.0, 3.0, 2.0])
     assert cheapest(costs, 0.5).tolist() == [False, True, True, True]
     assert cheapest(costs, 1.0).all()
@@ -159,9 +148,7 @@ def test_the_cheapest_share_of_hypotheses_is_told_by_cost() -> None:
         cheapest(costs, 0.0)
 
 
-def test_a_truth_far_from_all_hypotheses_is_outside_of_their_spread(
-    box: tuple[SdfGrid, trimesh.Trimesh],
-) -> None:
+def test_a_truth_far_from_all_hypotheses_is_outside_of_their_spread(box):
     estimates = inverse(poses(13, 30, spread=0.01, angle=0.1))
     distance, away = distance_of(box, method="exact"), np.eye(4)
     assert true_pose_rank(distance, estimates, away) > 0.5
@@ -169,9 +156,7 @@ def test_a_truth_far_from_all_hypotheses_is_outside_of_their_spread(
     assert true_pose_rank(distance, estimates, away) == pytest.approx(1.0 / 31.0)
 
 
-def test_the_rank_of_a_truth_drawn_like_the_hypotheses_is_uniform(
-    box: tuple[SdfGrid, trimesh.Trimesh],
-) -> None:
+def test_the_rank_of_a_truth_drawn_like_the_hypotheses_is_uniform(box):
     distance = distance_of(box, 30, method="grid")
     drawn = poses(14, 80 * 10, spread=0.02, angle=0.2).reshape(80, 10, 4, 4)
     ranks = [true_pose_rank(distance, inverse(some[1:]), some[0]) for some in drawn]
@@ -188,14 +173,12 @@ def test_the_rank_of_a_truth_drawn_like_the_hypotheses_is_uniform(
         (lambda: DistanceSettings(points=0), SettingError, "points is 0"),
     ],
 )
-def test_what_cannot_be_measured_is_named(
-    make: object, error: type[Exception], message: str
-) -> None:
+def test_what_cannot_be_measured_is_named(make, error, message):
     with pytest.raises(error, match=message):
-        make()  # type: ignore[operator]
+        make()
 
 
-def test_poses_that_are_not_finite_are_named(box: tuple[SdfGrid, trimesh.Trimesh]) -> None:
+def test_poses_that_are_not_finite_are_named(box):
     broken = poses(0, 2)
     broken[1, 0, 3] = np.nan
     with pytest.raises(PoseError, match="pose 1 is not finite"):

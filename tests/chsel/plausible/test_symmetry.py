@@ -1,16 +1,12 @@
 """Symmetries of objects against closed forms, and on real scans."""
 
-from __future__ import annotations
-
 from itertools import permutations, product
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from scipy.optimize import brentq
 
-from chsel.numerics.arrays import FloatArray
 from chsel.plausible.symmetry import (
     ObjectSymmetry,
     generated,
@@ -34,21 +30,21 @@ SCANS = {
 }
 
 
-def half_turn(axis: FloatArray) -> FloatArray:
+def half_turn(axis):
     return 2.0 * np.outer(axis, axis) / (axis @ axis) - np.eye(3)
 
 
-def turns_about(axis: FloatArray, count: int) -> FloatArray:
+def turns_about(axis, count):
     angles = np.arange(float(count)) * (2.0 * np.pi / count)
     return axis_angle(np.tile(axis, (count, 1)), angles)
 
 
-def dihedral(count: int, across: FloatArray = X) -> FloatArray:
+def dihedral(count, across=X):
     about = turns_about(Z, count)
     return np.concatenate([about, about @ half_turn(across)])
 
 
-def cube_rotations() -> FloatArray:
+def cube_rotations():
     signed = [
         np.eye(3)[list(order)] * signs
         for order in permutations(range(3))
@@ -57,13 +53,13 @@ def cube_rotations() -> FloatArray:
     return np.array([one for one in signed if np.linalg.det(one) > 0.0])
 
 
-def assert_same_set(found: FloatArray, expected: FloatArray, within: float = 1e-6) -> None:
+def assert_same_set(found, expected, within=1e-6):
     assert len(found) == len(expected)
     apart = np.abs(found[:, None] - expected).max(axis=(2, 3))
     assert (apart.min(axis=0) < within).all()
 
 
-def mug() -> trimesh.Trimesh:
+def mug():
     """A cup with a bottom and a handle."""
     outer = trimesh.creation.cylinder(0.04, 0.1)
     inner = trimesh.creation.cylinder(0.036, 0.1)
@@ -75,7 +71,7 @@ def mug() -> trimesh.Trimesh:
     return trimesh.boolean.difference([solid, inner], engine="manifold")
 
 
-def tetrahedron() -> trimesh.Trimesh:
+def tetrahedron():
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * 0.05
     return trimesh.convex.convex_hull(corners)
 
@@ -93,7 +89,7 @@ FINITE = {
 
 
 @pytest.mark.parametrize("name", FINITE)
-def test_finite_groups_are_found_in_any_frame(name: str) -> None:
+def test_finite_groups_are_found_in_any_frame(name):
     mesh, expected = FINITE[name]
     for pose in (np.eye(4), ANYWHERE):
         turned = mesh.copy().apply_transform(pose)
@@ -109,7 +105,7 @@ def test_finite_groups_are_found_in_any_frame(name: str) -> None:
     ("mesh", "count"),
     [(tetrahedron(), 12), (trimesh.creation.icosahedron(), 60)],
 )
-def test_groups_of_regular_bodies_are_complete(mesh: trimesh.Trimesh, count: int) -> None:
+def test_groups_of_regular_bodies_are_complete(mesh, count):
     found = object_symmetry(mesh).rotations
     assert len(found) == count
     again = generated(found)
@@ -131,7 +127,7 @@ def test_groups_of_regular_bodies_are_complete(mesh: trimesh.Trimesh, count: int
         (trimesh.creation.cone(0.05, 0.2), False),
     ],
 )
-def test_axes_of_revolution_are_found(mesh: trimesh.Trimesh, ends_swap: bool) -> None:
+def test_axes_of_revolution_are_found(mesh, ends_swap):
     found = object_symmetry(mesh.copy().apply_transform(ANYWHERE))
     assert found.axis is not None
     assert abs(found.axis @ ANYWHERE[:3, 2]) == pytest.approx(1.0, abs=1e-9)
@@ -140,14 +136,14 @@ def test_axes_of_revolution_are_found(mesh: trimesh.Trimesh, ends_swap: bool) ->
         np.testing.assert_allclose(found.rotations[1] @ found.axis, -found.axis, atol=1e-9)
 
 
-def moments(mesh: trimesh.Trimesh) -> FloatArray:
+def moments(mesh):
     """Second moments (3, 3) of a surface about the origin: edge middles are exact for squares."""
     middles = (mesh.triangles + np.roll(mesh.triangles, 1, axis=1)) / 2.0
     return np.einsum("f,fki,fkj->ij", mesh.area_faces, middles, middles)
 
 
-def test_an_axis_is_found_where_all_moments_of_inertia_are_equal() -> None:
-    def difference(height: float) -> float:
+def test_an_axis_is_found_where_all_moments_of_inertia_are_equal():
+    def difference(height):
         found = moments(trimesh.creation.cylinder(0.05, height))
         return float(found[2, 2] - found[0, 0])
 
@@ -159,7 +155,7 @@ def test_an_axis_is_found_where_all_moments_of_inertia_are_equal() -> None:
     assert abs(found.axis @ ANYWHERE[:3, 2]) == pytest.approx(1.0, abs=1e-9)
 
 
-def test_an_axis_is_found_in_a_scan_whose_normals_are_noise() -> None:
+def test_an_axis_is_found_in_a_scan_whose_normals_are_noise():
     can = trimesh.creation.cylinder(0.033, 0.1, sections=64)
     for _ in range(4):
         can = can.subdivide()
@@ -170,19 +166,19 @@ def test_an_axis_is_found_in_a_scan_whose_normals_are_noise() -> None:
     assert len(found.rotations) == 2
 
 
-def test_a_sheet_without_a_thickness_turns_over() -> None:
+def test_a_sheet_without_a_thickness_turns_over():
     """Points that stay within its borders do not show small rotations in its plane."""
     square = trimesh.Trimesh([X * 0, X, X + Y, Y], [[0, 1, 2], [0, 2, 3]], process=False)
     assert_same_set(object_symmetry(square).rotations, dihedral(4), within=2e-3)
 
 
-def test_a_sphere_has_all_rotations() -> None:
+def test_a_sphere_has_all_rotations():
     found = object_symmetry(trimesh.creation.icosphere(3, 0.1))
     assert found.sphere
     assert found.rotation_errors(rotation_vector(np.array([[0.0, 1.0, 2.0]]))).tolist() == [0.0]
 
 
-def test_an_open_end_is_not_the_other_end() -> None:
+def test_an_open_end_is_not_the_other_end():
     can = trimesh.creation.cylinder(0.05, 0.2)
     can.update_faces(can.triangles_center[:, 2] < 0.099)
     found = object_symmetry(can)
@@ -190,7 +186,7 @@ def test_an_open_end_is_not_the_other_end() -> None:
     assert len(found.rotations) == 1
 
 
-def test_the_tolerance_is_a_share_of_the_diameter() -> None:
+def test_the_tolerance_is_a_share_of_the_diameter():
     """A quarter turn of a bar whose sides differ by 3 and by 8 parts in 100."""
     assert len(object_symmetry(trimesh.creation.box((1.0, 1.03, 3.0))).rotations) == 8
     assert len(object_symmetry(trimesh.creation.box((1.0, 1.08, 3.0))).rotations) == 4
@@ -198,7 +194,7 @@ def test_the_tolerance_is_a_share_of_the_diameter() -> None:
     assert len(object_symmetry(trimesh.creation.box((1.0, 1.02, 1.04))).rotations) == 8
 
 
-def test_a_small_knob_is_seen_and_a_tiny_one_is_not() -> None:
+def test_a_small_knob_is_seen_and_a_tiny_one_is_not():
     for size, seen in ((0.006, False), (0.02, True)):
         knob = trimesh.creation.box((size, size, size))
         knob.apply_translation([0.05, 0.0, 0.0])
@@ -207,7 +203,7 @@ def test_a_small_knob_is_seen_and_a_tiny_one_is_not() -> None:
         assert (found.axis is None) == seen
 
 
-def test_the_centre_is_where_every_symmetry_leaves_it() -> None:
+def test_the_centre_is_where_every_symmetry_leaves_it():
     mesh = trimesh.creation.box((0.1, 0.2, 0.3))
     mesh.apply_translation([7.0, -3.0, 0.5])
     np.testing.assert_allclose(object_symmetry(mesh).centre, [7.0, -3.0, 0.5], atol=1e-12)
@@ -220,16 +216,14 @@ def test_the_centre_is_where_every_symmetry_leaves_it() -> None:
 @pytest.mark.parametrize(
     "vertices", [[[1.0, 2.0, 3.0]] * 3, [[0.0, 2.0, 3.0], [1.0, 2.0, 3.0], [2.0, 2.0, 3.0]]]
 )
-def test_a_mesh_without_an_area_has_no_symmetry(vertices: list[list[float]]) -> None:
+def test_a_mesh_without_an_area_has_no_symmetry(vertices):
     found = object_symmetry(trimesh.Trimesh(vertices, [[0, 1, 2]], process=False))
     assert_same_set(found.rotations, np.eye(3)[None])
     np.testing.assert_allclose(found.centre, [1.0, 2.0, 3.0])
 
 
 @pytest.mark.parametrize(("name", "count"), SCANS.items())
-def test_models_and_scans_have_the_symmetries_of_their_objects(
-    name: str, count: int, ycb_directory: Path
-) -> None:
+def test_models_and_scans_have_the_symmetries_of_their_objects(name, count, ycb_directory):
     mesh = load_mesh(ycb_directory / name / "google_16k" / "nontextured.ply")
     found = object_symmetry(mesh)
     assert len(found.rotations) == count
@@ -242,7 +236,7 @@ def test_models_and_scans_have_the_symmetries_of_their_objects(
     ("name", "count"),
     [("cracker_box", 4), ("mustard", 2), ("spam_can", 2), ("hammer", 1), ("clamp", 1)],
 )
-def test_our_models_have_the_symmetries_of_the_objects(name: str, count: int) -> None:
+def test_our_models_have_the_symmetries_of_the_objects(name, count):
     assert len(object_symmetry(load_model(name)).rotations) == count
 
 
@@ -250,14 +244,12 @@ def test_our_models_have_the_symmetries_of_the_objects(name: str, count: int) ->
     ("name", "count", "round_about"),
     [("icub_cylinder", 2, True), ("icub_lego", 1, False), ("ycbv_gelatin_box", 4, False)],
 )
-def test_meshes_of_real_measurements(
-    name: str, count: int, round_about: bool, real_directory: Path
-) -> None:
+def test_meshes_of_real_measurements(name, count, round_about, real_directory):
     found = object_symmetry(load_mesh(real_directory / f"{name}.obj"))
     assert (len(found.rotations), found.axis is not None) == (count, round_about)
 
 
-def test_without_a_mesh_there_is_the_centre_of_the_grid_alone() -> None:
+def test_without_a_mesh_there_is_the_centre_of_the_grid_alone():
     mesh = trimesh.creation.box((0.1, 0.2, 0.3))
     mesh.apply_translation([0.4, 0.0, 0.1])
     found = grid_symmetry(SdfGrid.from_mesh(mesh, 0.01))
@@ -267,7 +259,7 @@ def test_without_a_mesh_there_is_the_centre_of_the_grid_alone() -> None:
     np.testing.assert_allclose(grid_symmetry(thin).centre, [0.05, 0.1, 0.15])
 
 
-def test_angles_about_an_axis_are_those_between_axes() -> None:
+def test_angles_about_an_axis_are_those_between_axes():
     """Against the least angle over many rotations about it."""
     axis = np.array([0.36, 0.48, 0.8])
     errors = rotation_vector(np.random.default_rng(0).normal(size=(20, 3)))

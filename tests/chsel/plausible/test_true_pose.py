@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from chsel.errors import PoseError, SettingError
-from chsel.numerics.arrays import FloatArray
 from chsel.plausible import pose_scan
 from chsel.plausible.evaluation_cost import EvaluationCost
-from chsel.plausible.plausible_settings import EvaluationCostSettings, Offsets
+from chsel.plausible.plausible_settings import EvaluationCostSettings
 from chsel.plausible.pose_scan import PoseGrid, TruePoseSettings, find_true_pose
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, compose, inverse, rotation_angle, rotation_vector
@@ -23,7 +22,7 @@ QUICK = TruePoseSettings(
 )
 
 
-def test_the_true_pose_is_found_from_a_guess_some_centimetres_off() -> None:
+def test_the_true_pose_is_found_from_a_guess_some_centimetres_off():
     problem, truth = scene(np.random.default_rng(3), box(HALF, 0.01))
     stream = np.random.default_rng(0)
     sides = stream.uniform(-0.9, 0.9, (60, 3))
@@ -48,14 +47,12 @@ def test_the_true_pose_is_found_from_a_guess_some_centimetres_off() -> None:
     assert find_true_pose(problem, guess, replace(QUICK, passes=1)).cost >= found.cost
 
 
-def test_every_pass_looks_closer_around_the_best_pose_so_far(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_every_pass_looks_closer_around_the_best_pose_so_far(monkeypatch):
     """Reach becomes a spacing; spacing and angle shrink by their ratio, here to a quarter."""
     problem, truth = scene(np.random.default_rng(3), box(HALF))
     seen: list[PoseGrid] = []
 
-    def watched(centre: FloatArray, offsets: Offsets, rotations: FloatArray) -> PoseGrid:
+    def watched(centre, offsets, rotations):
         seen.append(PoseGrid(centre, offsets, rotations))
         return seen[-1]
 
@@ -77,7 +74,7 @@ def test_every_pass_looks_closer_around_the_best_pose_so_far(
         best = found.world_from_object
 
 
-def test_a_guess_that_nothing_beats_stays() -> None:
+def test_a_guess_that_nothing_beats_stays():
     problem, truth = scene(np.random.default_rng(3), box(HALF))
     problem = replace(problem, points=KnownPoints(known=truth[None, :3, 3], known_sdf=[-0.06]))
     by = EvaluationCost(problem, QUICK.cost).evaluate(inverse(truth)[None])[0]
@@ -85,7 +82,7 @@ def test_a_guess_that_nothing_beats_stays() -> None:
     assert found.cost <= by == found.guess_cost
 
 
-def test_what_cannot_be_searched_is_named() -> None:
+def test_what_cannot_be_searched_is_named():
     problem, _ = scene(np.random.default_rng(3), box(HALF))
     with pytest.raises(PoseError, match="guess"):
         find_true_pose(problem, np.ones((4, 4)))

@@ -1,7 +1,5 @@
 """What each policy prefers, where the answer can be told without it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +18,7 @@ PLACES = [(-0.06, 0.0), (0.06, 0.0), (0.0, 0.0), (0.25, 0.25)]
 
 
 @pytest.mark.parametrize("name", POLICIES)
-def test_only_actions_that_can_be_taken_are_chosen(name: str) -> None:
+def test_only_actions_that_can_be_taken_are_chosen(name):
     available = np.array([False, True, False, True])
     decision = build_policy(name).decide(ball_problem(TWO, along_x(PLACES), available=available))
     assert decision.chosen in (1, 3)
@@ -31,7 +29,7 @@ def test_only_actions_that_can_be_taken_are_chosen(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", POLICIES)
-def test_a_decision_is_a_function_of_its_problem(name: str) -> None:
+def test_a_decision_is_a_function_of_its_problem(name):
     problem = ball_problem(TWO, along_x(PLACES))
     policy = build_policy(name)
     first = policy.decide(problem)
@@ -50,7 +48,7 @@ def test_a_decision_is_a_function_of_its_problem(name: str) -> None:
         ("expected_loss", None),  # d / 2, all of it; the spread of two poses is d / sqrt(2)
     ],
 )
-def test_scores_of_two_places(name: str, scores: list[float] | None) -> None:
+def test_scores_of_two_places(name, scores):
     decision = build_policy(name).decide(ball_problem(TWO, along_x(PLACES)))
     scores = scores or [decision.spread / np.sqrt(2.0)] * 3 + [0.0]
     assert decision.score == pytest.approx(scores, rel=0.06, abs=1e-12)
@@ -60,12 +58,12 @@ def test_scores_of_two_places(name: str, scores: list[float] | None) -> None:
 @pytest.mark.parametrize(
     "name", ["hypothesis_pruning", "information", "expected_loss", "voxel_entropy"]
 )
-def test_what_all_poses_agree_on_is_worth_nothing(name: str) -> None:
+def test_what_all_poses_agree_on_is_worth_nothing(name):
     agreed = build_policy(name).decide(ball_problem(TWO[[0, 0]], along_x(PLACES)))
     assert agreed.score == pytest.approx(np.zeros(4), abs=1e-12)
 
 
-def test_the_nearest_way_is_to_the_mean_and_ends_where_the_action_ends() -> None:
+def test_the_nearest_way_is_to_the_mean_and_ends_where_the_action_ends():
     policy = build_policy("nearest_mean")
     between = policy.decide(ball_problem(TWO, along_x(PLACES)))
     assert between.score == pytest.approx([-0.06, -0.06, 0.0, -np.hypot(0.25, 0.25)], abs=3e-3)
@@ -75,7 +73,7 @@ def test_the_nearest_way_is_to_the_mean_and_ends_where_the_action_ends() -> None
     assert policy.decide(short).score == pytest.approx([-0.3, -np.hypot(0.3, 0.05)], abs=3e-3)
 
 
-def test_the_nearest_way_is_to_the_centre_of_an_object_whose_origin_is_beside_it() -> None:
+def test_the_nearest_way_is_to_the_centre_of_an_object_whose_origin_is_beside_it():
     """The ball's centre is 5 cm from its origin; turned and moved, it is at the world's origin."""
     quarter = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5 * np.pi))
     pose = inverse(compose(quarter, np.array([0.0, -0.05, 0.0])))
@@ -85,7 +83,7 @@ def test_the_nearest_way_is_to_the_centre_of_an_object_whose_origin_is_beside_it
     assert decision.score == pytest.approx([0.0, -0.06], abs=3e-3)
 
 
-def test_random_takes_every_available_action_as_often() -> None:
+def test_random_takes_every_available_action_as_often():
     policy = build_policy("random", {"probes": 1000, "stop": {"gain": 0.0}})
     available = np.array([True, False, True, True])
     problem = ball_problem(TWO, along_x(PLACES), available=available)
@@ -98,7 +96,7 @@ def test_random_takes_every_available_action_as_often() -> None:
 
 
 @pytest.mark.parametrize("name", POLICIES)
-def test_gains_are_a_second_and_other_ratings_are_not(name: str) -> None:
+def test_gains_are_a_second_and_other_ratings_are_not(name):
     actions = along_x(PLACES)
     seconds = np.array([1.0, 2.0, 4.0, 1.0])
     timed = Actions(actions.world_from_hand, actions.length, seconds)
@@ -108,7 +106,7 @@ def test_gains_are_a_second_and_other_ratings_are_not(name: str) -> None:
     assert np.array_equal(decision.score, usual.score / divisor)
 
 
-def test_no_gain_is_promised_by_an_action_that_cannot_be_taken() -> None:
+def test_no_gain_is_promised_by_an_action_that_cannot_be_taken():
     """The last action misses both places of the ball, the first tells them apart."""
     policy, actions = build_policy("information"), along_x(PLACES)
     for available, chosen, stop in (([3], -1, "gain"), ([0, 3], 0, "")):
@@ -117,7 +115,7 @@ def test_no_gain_is_promised_by_an_action_that_cannot_be_taken() -> None:
         assert (decision.chosen, decision.stop) == (chosen, stop)
 
 
-def test_rules_that_are_switched_off_end_no_session() -> None:
+def test_rules_that_are_switched_off_end_no_session():
     """Of some numbers of poses the rounding of what a miss leaves of the spread is above it."""
     policy = build_policy("information", {"stop": {"spread": 0.0, "gain": 0.0}})
     for count in range(2, 12):
@@ -125,7 +123,7 @@ def test_rules_that_are_switched_off_end_no_session() -> None:
         assert policy.decide(ball_problem(poses, along_x([(0.25, 0.25)]))).stop == ""
 
 
-def test_names_and_settings_that_do_not_exist_are_refused() -> None:
+def test_names_and_settings_that_do_not_exist_are_refused():
     with pytest.raises(SettingError, match="policy is 'greedy'; accepted: grid, random"):
         build_policy("greedy")
     with pytest.raises(SettingError, match=r"policy.prob does not exist; did you mean probes"):

@@ -1,15 +1,11 @@
 """Decision after decision: beliefs, surprises, and what a policy of somebody else may give."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from chsel.errors import ChselError, SettingError
-from chsel.next_probe.decision_problem import Decision, DecisionProblem
 from chsel.next_probe.forecast import BeliefSettings, belief_after, belief_before, surprise
 from chsel.policies import build_policy
 from chsel.policies.policy import PolicySettings
@@ -32,7 +28,7 @@ NOWHERE = np.zeros((0, 3))
 PLACES = [(-0.06, 0.0), (0.06, 0.0), (0.0, 0.0)]
 
 
-def test_before_any_contact_the_object_stands_on_the_floor_outside_of_free_space() -> None:
+def test_before_any_contact_the_object_stands_on_the_floor_outside_of_free_space():
     grid = np.stack(np.meshgrid(*[np.arange(-0.3, 0.31, 0.02)] * 3), axis=-1).reshape(-1, 3)
     left = KnownPoints(free=grid[grid[:, 0] < 0.1])
     settings = BeliefSettings(poses=40, floor=-0.1)
@@ -48,7 +44,7 @@ def test_before_any_contact_the_object_stands_on_the_floor_outside_of_free_space
     assert belief.weights.sum() == pytest.approx(1.0)
 
 
-def test_after_a_registration_candidates_count_and_else_hypotheses() -> None:
+def test_after_a_registration_candidates_count_and_else_hypotheses():
     poses = at(*((0.01 * n, 0.0, 0.0) for n in range(30)))
     found = Hypotheses(
         poses[:3], np.zeros(3), np.array([False, True, False]), np.zeros(3, np.int64), poses
@@ -61,7 +57,7 @@ def test_after_a_registration_candidates_count_and_else_hypotheses() -> None:
     np.testing.assert_array_equal(belief.object_from_world, poses[::3])
 
 
-def felt(weights: tuple[float, ...], contact: Any, noise: float = 0.002) -> float:
+def felt(weights, contact, noise=0.002):
     """How surprising it is to touch a place with the action that meets the first of two balls."""
     poses = at((0.0, 0.0, 0.0), (0.0, 0.2, 0.2))
     problem = ball_problem(poses, along_x([(0.0, 0.0)]), weights=np.array(weights))
@@ -70,7 +66,7 @@ def felt(weights: tuple[float, ...], contact: Any, noise: float = 0.002) -> floa
     return surprise(problem, decision, noise, contact)
 
 
-def test_surprise_is_minus_the_logarithm_of_the_chance_of_what_happened() -> None:
+def test_surprise_is_minus_the_logarithm_of_the_chance_of_what_happened():
     here = np.array([-RADIUS, 0.0, 0.0])
     assert felt((1.0, 0.0), here) == pytest.approx(-np.log(0.95 + 0.0005), abs=0.05)
     assert felt((0.5, 0.5), None) == pytest.approx(-np.log(0.95 * 0.5), abs=0.01)
@@ -80,7 +76,7 @@ def test_surprise_is_minus_the_logarithm_of_the_chance_of_what_happened() -> Non
     assert felt((1.0, 0.0), here + 0.01 * np.eye(3)[0], noise=0.01) < 1.0
 
 
-def test_what_a_probe_touches_first_is_what_surprises() -> None:
+def test_what_a_probe_touches_first_is_what_surprises():
     session = steering(_Somebody())
     decision = session.decide(0, KnownPoints(), None, np.ones(3, dtype=bool)).decision
     near = decision.contacts[np.isfinite(decision.contacts[:, 0])][0]
@@ -96,15 +92,15 @@ class _Somebody:
 
     settings = PolicySettings()
 
-    def __init__(self, **changes: Any) -> None:
+    def __init__(self, **changes):
         self._changes = changes
 
-    def decide(self, problem: DecisionProblem) -> Decision:
+    def decide(self, problem):
         stop = {"stop": {"spread": 0.0, "gain": 0.0}}
         return replace(build_policy("grid", stop).decide(problem), **self._changes)
 
 
-def steering(policy: Any) -> Steering:
+def steering(policy):
     return Steering(policy, ball(), WORKSPACE, 0.01, along_x(PLACES), box_hand())
 
 
@@ -119,13 +115,13 @@ def steering(policy: Any) -> Steering:
         ({"contacts": NOWHERE}, r"\(0, 3\)\]; accepted"),
     ],
 )
-def test_what_is_no_decision_is_refused(changes: dict[str, Any], message: str) -> None:
+def test_what_is_no_decision_is_refused(changes, message):
     available = np.array([True, False, True])
     with pytest.raises(ChselError, match=message):
         steering(_Somebody(**changes)).decide(0, KnownPoints(), None, available)
 
 
-def test_a_floor_above_the_workspace_is_an_error() -> None:
+def test_a_floor_above_the_workspace_is_an_error():
     session = steering(build_policy("grid", {"belief": {"floor": 7.0}}))
     with pytest.raises(
         SettingError, match=r"policy\.belief\.floor is 7, above .*; accepted: .* null"
@@ -133,7 +129,7 @@ def test_a_floor_above_the_workspace_is_an_error() -> None:
         session.decide(0, KnownPoints(), None, np.ones(3, dtype=bool))
 
 
-def test_an_outcome_follows_a_choice() -> None:
+def test_an_outcome_follows_a_choice():
     session = steering(_Somebody())
     with pytest.raises(ChselError, match="no action was chosen"):
         session.felt(NOWHERE)

@@ -1,15 +1,12 @@
 """The entropy that a hand sweeps, against the definition, voxel by voxel."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from chsel.next_probe.decision_problem import Actions, DecisionProblem
+from chsel.next_probe.decision_problem import Actions
 from chsel.next_probe.forecast import Forecast
-from chsel.numerics.arrays import FloatArray
 from chsel.policies import build_policy
 from chsel.policies.voxel_entropy import filled_points, occupancy_entropy, voxel_box
 from chsel.problem.points import KnownPoints, Workspace
@@ -27,7 +24,7 @@ SIDE = 0.02
 VOLUME = 4.0 / 3.0 * np.pi * RADIUS**3
 
 
-def some_problem(points: KnownPoints | None = None) -> DecisionProblem:
+def some_problem(points=None):
     """Five balls of unequal weight, and actions from several sides."""
     stream = np.random.default_rng(5)
     poses = at(*stream.uniform(-0.12, 0.12, (5, 3)).tolist())
@@ -39,7 +36,7 @@ def some_problem(points: KnownPoints | None = None) -> DecisionProblem:
     return ball_problem(poses, actions, weights=weights, points=points)
 
 
-def swept_by_definition(problem: DecisionProblem) -> FloatArray:
+def swept_by_definition(problem):
     """Of each action: sum over voxels that it sweeps of entropy times the chance to get there."""
     box = voxel_box(problem.workspace, SIDE)
     poses, weights = problem.belief.object_from_world, problem.belief.weights
@@ -71,7 +68,7 @@ def swept_by_definition(problem: DecisionProblem) -> FloatArray:
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_the_entropy_swept_is_that_of_the_definition(known: bool) -> None:
+def test_the_entropy_swept_is_that_of_the_definition(known):
     places = np.random.default_rng(1).uniform(-0.2, 0.2, (300, 3))
     points = KnownPoints(places[:100], places[100:200], places[200:]) if known else None
     problem = some_problem(points)
@@ -82,7 +79,7 @@ def test_the_entropy_swept_is_that_of_the_definition(known: bool) -> None:
     assert rated == pytest.approx(expected, rel=1e-9)
 
 
-def test_voxels_that_half_of_the_belief_fills_count_ln_2() -> None:
+def test_voxels_that_half_of_the_belief_fills_count_ln_2():
     problem = ball_problem(at((-0.1, 0.0, 0.0), (0.1, 0.0, 0.0)), along_x([(0.0, 0.0)]))
     entropy = occupancy_entropy(problem, voxel_box(WORKSPACE, 0.01))
     assert np.unique(entropy) == pytest.approx([0.0, np.log(2.0)])
@@ -100,7 +97,7 @@ def test_voxels_that_half_of_the_belief_fills_count_ln_2() -> None:
         (WORKSPACE, 10.0),
     ],
 )
-def test_any_workspace_and_voxel_take_bounded_memory(workspace: Workspace, voxel: float) -> None:
+def test_any_workspace_and_voxel_take_bounded_memory(workspace, voxel):
     problem = replace(some_problem(), workspace=workspace)
     assert np.prod(voxel_box(workspace, voxel).counts) <= 1e6
     decision = build_policy("voxel_entropy", {"voxel": voxel}).decide(problem)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import numba
@@ -13,11 +12,11 @@ from chsel.qd import emitters
 
 
 @pytest.fixture(scope="module")
-def searches_around() -> Iterator[Callable[..., None]]:
+def searches_around():
     """Compiles the searches, as they are, around other functions instead of those of poses."""
     with pytest.MonkeyPatch.context() as patch:
 
-        def around(*functions: Any) -> None:
+        def around(*functions):
             for function in functions[1:]:
                 patch.setattr(emitters, function.__name__, function)
             patch.setattr(emitters, "costs_of", _one_by_one(functions[0]))
@@ -28,11 +27,11 @@ def searches_around() -> Iterator[Callable[..., None]]:
         yield around
 
 
-def _one_by_one(cost_of: Any) -> Any:
+def _one_by_one(cost_of):
     """What fills the costs of several vectors, of what returns that of one."""
 
     @numba.njit
-    def costs_of(model, space, vectors, costs, work):  # type: ignore[no-untyped-def]
+    def costs_of(model, space, vectors, costs, work):
         for n in range(len(vectors)):
             if all_finite(vectors[n]):
                 costs[n] = cost_of(model, space, vectors[n], work)

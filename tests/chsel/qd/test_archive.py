@@ -11,7 +11,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from chsel.errors import ChselError
-from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.qd.archive import GridArchive, rank, sampled_cell
 from chsel.qd.measures import MEASURES, VECTOR, Measure, MeasureCode
 
@@ -19,39 +18,39 @@ XY = Measure(("x", "y"), MeasureCode(VECTOR, 2))
 
 
 @numba.njit
-def sampled(objectives, uniform):  # type: ignore[no-untyped-def]
+def sampled(objectives, uniform):
     return sampled_cell(objectives, uniform)
 
 
 @pytest.fixture
-def archive() -> GridArchive:
+def archive():
     return GridArchive(XY, np.array([0.0, -1.0]), np.array([1.0, 1.0]), bins=4, dimension=2)
 
 
-def cells_of(archive: GridArchive, measures: FloatArray) -> IntArray:
+def cells_of(archive, measures):
     return archive.add(measures, np.zeros(len(measures)), measures).cells
 
 
-def add(archive: GridArchive, measures: list[list[float]], objectives: list[float]):  # type: ignore[no-untyped-def]
+def add(archive, measures, objectives):
     batch = archive.add(np.array(measures), np.array(objectives), np.array(measures))
     return batch.status, batch.value
 
 
-def test_cells_are_row_major_with_the_last_measure_fastest(archive: GridArchive) -> None:
+def test_cells_are_row_major_with_the_last_measure_fastest(archive):
     cells = cells_of(archive, np.array([[0.1, -0.9], [0.1, 0.9], [0.9, -0.9], [0.3, 0.1]]))
     np.testing.assert_array_equal(cells, [0, 3, 12, 6])
 
 
-def test_measures_outside_of_the_range_go_to_the_cells_at_its_edge(archive: GridArchive) -> None:
+def test_measures_outside_of_the_range_go_to_the_cells_at_its_edge(archive):
     cells = cells_of(archive, np.array([[-9.0, -9.0], [9.0, 9.0], [-9.0, 0.1], [1.0, 1.0]]))
     np.testing.assert_array_equal(cells, [0, 15, 2, 15])
 
 
-def test_a_measure_on_a_border_belongs_to_the_cell_above(archive: GridArchive) -> None:
+def test_a_measure_on_a_border_belongs_to_the_cell_above(archive):
     np.testing.assert_array_equal(cells_of(archive, np.array([[0.25, 0.0]])), [6])
 
 
-def test_status_and_value_are_against_the_archive_before_the_batch(archive: GridArchive) -> None:
+def test_status_and_value_are_against_the_archive_before_the_batch(archive):
     add(archive, [[0.1, -0.9]], [-5.0])
     status, value = add(
         archive,
@@ -64,13 +63,13 @@ def test_status_and_value_are_against_the_archive_before_the_batch(archive: Grid
     np.testing.assert_array_equal(archive.costs, [4.0, 2.0])
 
 
-def test_of_equals_in_a_batch_the_first_stays(archive: GridArchive) -> None:
+def test_of_equals_in_a_batch_the_first_stays(archive):
     solutions = np.array([[0.1, -0.9], [0.12, -0.9], [0.14, -0.9]])
     archive.add(solutions, np.array([-2.0, -1.0, -1.0]), solutions)
     np.testing.assert_array_equal(archive.solutions, solutions[1:2])
 
 
-def test_elites_are_sampled_from_occupied_cells_alone(archive: GridArchive) -> None:
+def test_elites_are_sampled_from_occupied_cells_alone(archive):
     add(archive, [[0.1, -0.9], [0.9, 0.9], [0.3, 0.1]], [-1.0, -2.0, -3.0])
     uniform = np.linspace(0.0, 1.0, 300, endpoint=False)
     drawn = np.array([sampled(archive.cells.objectives, u) for u in uniform])
@@ -79,7 +78,7 @@ def test_elites_are_sampled_from_occupied_cells_alone(archive: GridArchive) -> N
     np.testing.assert_array_equal(counts, [100, 100, 100])
 
 
-def test_an_empty_archive_has_no_elite_to_sample(archive: GridArchive) -> None:
+def test_an_empty_archive_has_no_elite_to_sample(archive):
     assert sampled(archive.cells.objectives, 0.5) == -1
     with pytest.raises(ChselError, match="no pose"):
         _ = archive.best_solution
@@ -87,9 +86,7 @@ def test_an_empty_archive_has_no_elite_to_sample(archive: GridArchive) -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("where", ["solution", "objective", "measure"])
-def test_numbers_that_are_not_finite_never_enter(
-    archive: GridArchive, where: str, bad: float
-) -> None:
+def test_numbers_that_are_not_finite_never_enter(archive, where, bad):
     solutions = np.array([[0.1, -0.9], [0.9, 0.9]])
     measures, objectives = solutions.copy(), np.array([-1.0, -2.0])
     target = {"solution": solutions, "objective": objectives, "measure": measures}[where]
@@ -101,7 +98,7 @@ def test_numbers_that_are_not_finite_never_enter(
     np.testing.assert_array_equal(archive.occupied, [0])
 
 
-def test_snapshot_is_a_copy_with_its_statistics(archive: GridArchive) -> None:
+def test_snapshot_is_a_copy_with_its_statistics(archive):
     add(archive, [[0.1, -0.9], [0.9, 0.9]], [-1.0, -2.0])
     snapshot = archive.snapshot(iteration=7, refinement=1)
     add(archive, [[0.1, -0.9], [0.3, 0.1]], [-0.5, -2.0])
@@ -111,7 +108,7 @@ def test_snapshot_is_a_copy_with_its_statistics(archive: GridArchive) -> None:
     assert (snapshot.iteration, snapshot.refinement) == (7, 1)
 
 
-def test_angles_across_half_a_turn_stay_neighbours() -> None:
+def test_angles_across_half_a_turn_stay_neighbours():
     angle = MEASURES["plane_angle"]
     values = np.array([[np.pi - 0.02], [-np.pi + 0.02], [np.pi - 0.01], [-np.pi + 0.01]])
     mean, deviation = angle.moments(values)
@@ -130,11 +127,11 @@ Solution = tuple[tuple[float, ...], float]
 class PlainArchive:
     """The definition: dictionaries and loops."""
 
-    def __init__(self, circular: bool) -> None:
+    def __init__(self, circular):
         self.circular = circular
         self.best: dict[int, tuple[float, tuple[float, ...]]] = {}
 
-    def cell(self, measures: tuple[float, ...]) -> int:
+    def cell(self, measures):
         cell = 0
         for x in measures:
             if self.circular:
@@ -143,7 +140,7 @@ class PlainArchive:
             cell = cell * BINS + min(max(place, 0), BINS - 1)
         return cell
 
-    def add(self, batch: list[Solution]) -> list[tuple[int, float]]:
+    def add(self, batch):
         before = dict(self.best)
         results = []
         for measures, objective in batch:
@@ -172,7 +169,7 @@ SOLUTIONS = st.tuples(
 @settings(deadline=None, max_examples=200)
 @given(st.booleans(), st.lists(st.lists(SOLUTIONS, min_size=1, max_size=9), max_size=4))
 @example(True, [[((math.pi + 0.1, 3.0 * math.pi), -1.0), ((0.1 - math.pi, -math.pi), 0.0)]])
-def test_insertion_is_that_of_a_plain_loop(circular: bool, batches: list[list[Solution]]) -> None:
+def test_insertion_is_that_of_a_plain_loop(circular, batches):
     measure = Measure(("x", "y"), MeasureCode(VECTOR, 2), circular)
     lower, upper = np.full(2, LOWER), np.full(2, UPPER)
     archive = GridArchive(measure, lower, upper, bins=BINS, dimension=3)
@@ -194,7 +191,7 @@ def test_insertion_is_that_of_a_plain_loop(circular: bool, batches: list[list[So
 
 
 @numba.njit
-def ranked(status, value, order):  # type: ignore[no-untyped-def]
+def ranked(status, value, order):
     return rank(status, value, order)
 
 
@@ -206,7 +203,7 @@ def ranked(status, value, order):  # type: ignore[no-untyped-def]
         max_size=70,
     )
 )
-def test_ranking_is_by_status_then_value_then_the_later(pairs: list[tuple[int, float]]) -> None:
+def test_ranking_is_by_status_then_value_then_the_later(pairs):
     status, value = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
     order = np.zeros(len(pairs), dtype=np.int64)
     improved = ranked(status, value, order)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import pytest
 
-from chsel.numerics.arrays import FloatArray, digest
-from chsel.problem.registration_problem import ArchiveSnapshot, NullObserver
+from chsel.numerics.arrays import digest
+from chsel.problem.registration_problem import NullObserver
 from chsel.problem.streams import StreamKey
 from chsel.qd import emitters
 from chsel.qd.archive import GridArchive
@@ -18,7 +17,6 @@ from chsel.qd.emitters import (
     SEARCHES,
     EmitterSettings,
     MegaSearch,
-    MeSearch,
     fill_archive,
     me_search,
     mega_search,
@@ -37,22 +35,22 @@ class Landscape(NamedTuple):
 
     kind: int
 
-    def costs(self, vectors: FloatArray) -> FloatArray:
+    def costs(self, vectors):
         return np.array([cost_of(self, 0, vector, 0) for vector in vectors])
 
 
 class LandscapeObjective:
     """What the searches ask for in place of chsel.cost.objective.Objective."""
 
-    def __init__(self, kind: int) -> None:
+    def __init__(self, kind):
         self.model, self.space_arrays = Landscape(kind), 0
 
-    def work(self) -> int:
+    def work(self):
         return 0
 
 
 @numba.njit
-def cost_of(model, space, vector, work):  # type: ignore[no-untyped-def]
+def cost_of(model, space, vector, work):
     total = 0.0
     for j in range(4):
         if not np.isfinite(vector[j]):
@@ -66,7 +64,7 @@ def cost_of(model, space, vector, work):  # type: ignore[no-untyped-def]
 
 
 @numba.njit
-def cost_and_gradient_of(model, space, vector, gradient, work):  # type: ignore[no-untyped-def]
+def cost_and_gradient_of(model, space, vector, gradient, work):
     for j in range(4):
         gradient[j] = 0.0 if model.kind == FLAT else 2.0 * (j + 1.0) * vector[j]
     if model.kind == NAN_GRADIENT:
@@ -75,43 +73,43 @@ def cost_and_gradient_of(model, space, vector, gradient, work):  # type: ignore[
 
 
 @numba.njit
-def measures_of(space, measure, vector, out):  # type: ignore[no-untyped-def]
+def measures_of(space, measure, vector, out):
     out[0], out[1] = vector[0], vector[1]
 
 
 @numba.njit
-def measure_gradients_of(space, measure, vector, out):  # type: ignore[no-untyped-def]
+def measure_gradients_of(space, measure, vector, out):
     out[:] = 0.0
     out[0, 0] = out[1, 1] = 1.0
 
 
 @pytest.fixture(scope="module", autouse=True)
-def searches_of_a_landscape(searches_around: Callable[..., None]) -> None:
+def searches_of_a_landscape(searches_around):
     searches_around(cost_of, cost_and_gradient_of, measures_of, measure_gradients_of)
 
 
 class Watcher(NullObserver):
     """Wants snapshots at an interval."""
 
-    def __init__(self, interval: int) -> None:
+    def __init__(self, interval):
         self.snapshot_interval = interval
         self.heard: list[tuple[str, int]] = []
 
-    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+    def trace(self, stage, iteration, vectors, cost):
         self.heard.append(("trace", iteration))
 
-    def progress(self, stage: str, iteration: int, total: int) -> None:
+    def progress(self, stage, iteration, total):
         self.heard.append((stage, iteration))
 
-    def snapshot(self, archive: ArchiveSnapshot) -> None:
+    def snapshot(self, archive):
         self.heard.append(("snapshot", archive.iteration))
 
 
-def empty_archive() -> GridArchive:
+def empty_archive():
     return GridArchive(MEASURE, np.full(2, -0.5), np.full(2, 0.5), bins=8, dimension=4)
 
 
-def found(name: str, kind: int, interval: int = 0, count: int = COUNT) -> GridArchive:
+def found(name, kind, interval=0, count=COUNT):
     """The archive after a search."""
     archive = empty_archive()
     objective: Any = LandscapeObjective(kind)
@@ -123,7 +121,7 @@ def found(name: str, kind: int, interval: int = 0, count: int = COUNT) -> GridAr
 class Stepper:
     """One search, iteration by iteration, on one landscape after another."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name):
         self.archive, self.iteration = empty_archive(), 0
         self.search: Any = (
             mega_search(START, 2, COUNT, SETTINGS)
@@ -136,24 +134,24 @@ class Stepper:
         self._normals = random.standard_normal((ITERATIONS, COUNT, n))
         self.elites = random.random(ITERATIONS)
 
-    def step(self, kind: int) -> None:
+    def step(self, kind):
         landscape = emitters.Landscape(Landscape(kind), 0, MEASURE.code, 0)
         random, span = (self._normals, self.elites), (self.iteration, self.iteration + 1)
         self._loop(landscape, self.archive.cells, self.search, *random, *span)
         self.iteration += 1
 
 
-def bytes_of(archive: GridArchive) -> str:
+def bytes_of(archive):
     return digest(archive.cells.objectives, archive.cells.solutions, archive.cells.measures)
 
 
-def center(search: MegaSearch | MeSearch) -> FloatArray:
+def center(search):
     """What a restart puts on an elite."""
     return search.theta if isinstance(search, MegaSearch) else search.strategy.mean
 
 
 @pytest.mark.parametrize("name", SEARCHES)
-def test_a_search_fills_the_archive_and_finds_the_optimum(name: str) -> None:
+def test_a_search_fills_the_archive_and_finds_the_optimum(name):
     archive = found(name, QUADRATIC)
     assert len(archive.occupied) > 40
     assert archive.costs.min() < 0.02
@@ -165,15 +163,15 @@ def test_a_search_fills_the_archive_and_finds_the_optimum(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SEARCHES)
-def test_iterations_between_calls_change_no_byte(name: str) -> None:
+def test_iterations_between_calls_change_no_byte(name):
     assert len({bytes_of(found(name, QUADRATIC, interval)) for interval in (0, 1, 7, 25)}) == 1
 
 
 @pytest.mark.parametrize("total", [0, 16])
-def test_an_observer_hears_every_ten_iterations_and_at_its_interval(total: int) -> None:
+def test_an_observer_hears_every_ten_iterations_and_at_its_interval(total):
     watcher, objective, settings = Watcher(7), LandscapeObjective(QUADRATIC), EmitterSettings(total)
     key, archive = StreamKey(4, 0), empty_archive()
-    fill_archive("cma_me", objective, archive, START, COUNT, settings, key, watcher)  # type: ignore[arg-type]
+    fill_archive("cma_me", objective, archive, START, COUNT, settings, key, watcher)
     expected = [("snapshot", 7), ("trace", 10), ("cma_me", 10), ("snapshot", 14)]
     expected += [("trace", 16), ("cma_me", 16), ("snapshot", 16)]
     assert watcher.heard == [("trace", 0), ("snapshot", 0), *(expected if total else [])]
@@ -181,19 +179,19 @@ def test_an_observer_hears_every_ten_iterations_and_at_its_interval(total: int) 
 
 @pytest.mark.parametrize("name", SEARCHES)
 @pytest.mark.parametrize("kind", [NAN, INFINITE])
-def test_costs_that_are_not_finite_leave_the_archive_empty(name: str, kind: int) -> None:
+def test_costs_that_are_not_finite_leave_the_archive_empty(name, kind):
     assert len(found(name, kind).occupied) == 0
 
 
 @pytest.mark.parametrize("name", SEARCHES)
-def test_a_search_lives_with_costs_of_which_some_are_nan(name: str) -> None:
+def test_a_search_lives_with_costs_of_which_some_are_nan(name):
     archive = found(name, NAN_BEYOND)
     assert len(archive.occupied) > 20
     assert np.isfinite(archive.costs).all()
     assert (np.abs(archive.solutions[:, 3]) <= 0.25).all()
 
 
-def test_a_gradient_of_nan_is_no_direction() -> None:
+def test_a_gradient_of_nan_is_no_direction():
     archive = found("cma_mega", NAN_GRADIENT)
     assert np.isfinite(archive.solutions).all()
     assert len(archive.occupied) > 20
@@ -202,7 +200,7 @@ def test_a_gradient_of_nan_is_no_direction() -> None:
 
 
 @pytest.mark.parametrize("name", SEARCHES)
-def test_without_improvement_it_restarts_from_the_chosen_elite(name: str) -> None:
+def test_without_improvement_it_restarts_from_the_chosen_elite(name):
     stepper = Stepper(name)
     for _ in range(8):
         stepper.step(QUADRATIC)
@@ -224,7 +222,7 @@ def test_without_improvement_it_restarts_from_the_chosen_elite(name: str) -> Non
 
 @pytest.mark.parametrize("name", SEARCHES)
 @pytest.mark.parametrize("degenerate", ["covariance", "step"])
-def test_a_degenerate_strategy_restarts_although_it_improved(name: str, degenerate: str) -> None:
+def test_a_degenerate_strategy_restarts_although_it_improved(name, degenerate):
     stepper = Stepper(name)
     strategy = stepper.search.strategy
     if degenerate == "covariance":
@@ -239,7 +237,7 @@ def test_a_degenerate_strategy_restarts_although_it_improved(name: str, degenera
 
 
 @pytest.mark.parametrize("name", SEARCHES)
-def test_vectors_that_are_not_finite_are_not_evaluated(name: str) -> None:
+def test_vectors_that_are_not_finite_are_not_evaluated(name):
     stepper = Stepper(name)
     stepper.step(QUADRATIC)
     stepper.search.strategy.sigma[0] = np.inf
@@ -250,7 +248,7 @@ def test_vectors_that_are_not_finite_are_not_evaluated(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SEARCHES)
-def test_on_a_flat_cost_it_restarts_as_soon_as_all_rank_alike(name: str) -> None:
+def test_on_a_flat_cost_it_restarts_as_soon_as_all_rank_alike(name):
     stepper = Stepper(name)
     restarts = 0
     for _ in range(30):
@@ -260,7 +258,7 @@ def test_on_a_flat_cost_it_restarts_as_soon_as_all_rank_alike(name: str) -> None
     np.testing.assert_array_equal(stepper.archive.costs, 1.0)
 
 
-def test_theta_moves_by_adam_towards_the_weighted_mean_of_the_parents() -> None:
+def test_theta_moves_by_adam_towards_the_weighted_mean_of_the_parents():
     stepper = Stepper("cma_mega")
     theta, first, second = START, np.zeros(4), np.zeros(4)
     for t in range(1, 4):
@@ -278,7 +276,7 @@ def test_theta_moves_by_adam_towards_the_weighted_mean_of_the_parents() -> None:
         np.testing.assert_allclose(stepper.search.theta, theta, rtol=1e-12, atol=1e-15)
 
 
-def test_branches_leave_theta_along_normalised_gradients() -> None:
+def test_branches_leave_theta_along_normalised_gradients():
     stepper = Stepper("cma_mega")
     stepper.step(QUADRATIC)
     search = stepper.search

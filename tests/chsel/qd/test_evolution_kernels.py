@@ -1,20 +1,17 @@
 """The compiled evolution strategy against CMA-ES written with matrices."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 import pytest
 
-from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.qd import evolution_kernels as evolution
-from chsel.qd.evolution_kernels import Strategy, strategy_around
+from chsel.qd.evolution_kernels import strategy_around
 
 
 class MatrixStrategy:
     """Hansen's tutorial with positive weights of any number of parents."""
 
-    def __init__(self, mean: FloatArray, batch: int, sigma: float, parity: bool) -> None:
+    def __init__(self, mean, batch, sigma, parity):
         n = len(mean)
         self.n, self.batch, self.parity = n, batch, parity
         self.mean, self.sigma, self.covariance = mean, sigma, np.eye(n)
@@ -24,7 +21,7 @@ class MatrixStrategy:
         c1, cmu = self.rates(max(batch // 2, 1))[3:5]
         self.gap = batch / (2.0 * (c1 + cmu) * n)
 
-    def rates(self, mu: int) -> tuple[FloatArray, float, float, float, float, float, float]:
+    def rates(self, mu):
         n = self.n
         raw = np.log(mu + 0.5) - np.log(np.arange(mu) + 1.0)
         weights = raw / raw.sum()
@@ -36,7 +33,7 @@ class MatrixStrategy:
         damping = 1.0 + 2.0 * max(0.0, np.sqrt((m - 1.0) / (n + 1.0)) - 1.0) + cs
         return weights, cc, cs, c1, cmu, damping, m
 
-    def ask(self, normals: FloatArray, vectors: FloatArray) -> FloatArray:
+    def ask(self, normals, vectors):
         """Samples; `vectors` settle signs, and the basis where eigenvalues are equal."""
         if self.told > self.decomposed_at + self.gap:
             self.values, self.vectors = np.linalg.eigvalsh(self.covariance), vectors.copy()
@@ -47,7 +44,7 @@ class MatrixStrategy:
         root = self.vectors @ np.diag(np.sqrt(self.values))
         return self.mean + self.sigma * normals @ root.T
 
-    def tell(self, parents: FloatArray) -> None:
+    def tell(self, parents):
         self.told += self.batch
         if len(parents) == 0:
             return
@@ -73,28 +70,28 @@ class MatrixStrategy:
 
 
 @numba.njit
-def ask(strategy, normals, samples):  # type: ignore[no-untyped-def]
+def ask(strategy, normals, samples):
     evolution.ask(strategy, normals, samples)
 
 
 @numba.njit
-def tell(strategy, samples, order, parents):  # type: ignore[no-untyped-def]
+def tell(strategy, samples, order, parents):
     evolution.tell(strategy, samples, order, parents)
 
 
 @numba.njit
-def reset(strategy):  # type: ignore[no-untyped-def]
+def reset(strategy):
     evolution.reset(strategy)
 
 
 @numba.njit
-def stopped(strategy, order, status, value):  # type: ignore[no-untyped-def]
+def stopped(strategy, order, status, value):
     return evolution.stopped(strategy, order, status, value)
 
 
 @pytest.mark.parametrize("parity", [False, True])
 @pytest.mark.parametrize(("n", "batch"), [(2, 29), (3, 29), (9, 30), (7, 5), (4, 1)])
-def test_samples_are_those_of_cma_es_with_matrices(n: int, batch: int, parity: bool) -> None:
+def test_samples_are_those_of_cma_es_with_matrices(n, batch, parity):
     random = np.random.default_rng(n)
     mean, samples = random.standard_normal(n), np.zeros((batch, n))
     ours = strategy_around(mean, batch, 0.7, ribs_parity=parity)
@@ -119,7 +116,7 @@ def test_samples_are_those_of_cma_es_with_matrices(n: int, batch: int, parity: b
 
 
 @pytest.mark.parametrize(("squared_step", "steady"), [(7.0, True), (8.9, True), (9.1, False)])
-def test_path_c_waits_while_path_s_is_too_long(squared_step: float, steady: bool) -> None:
+def test_path_c_waits_while_path_s_is_too_long(squared_step, steady):
     # For n = 3, one parent, sigma = 1: |p_s|^2 / n / (1 - (1 - c_s)^2) = |y|^2 / 3, below 3.
     strategy = strategy_around(np.zeros(3), 5, 1.0)
     samples = np.zeros((5, 3))
@@ -128,12 +125,12 @@ def test_path_c_waits_while_path_s_is_too_long(squared_step: float, steady: bool
     assert (strategy.path_c[1] > 0.0) == steady
 
 
-def strategy_and_ranking(batch: int) -> tuple[Strategy, IntArray, IntArray, FloatArray]:
+def strategy_and_ranking(batch):
     order = np.arange(batch)
     return strategy_around(np.zeros(3), batch, 0.5), order, np.ones_like(order), -1.0 * order
 
 
-def test_it_stops_at_a_degenerate_covariance_a_tiny_step_or_a_flat_ranking() -> None:
+def test_it_stops_at_a_degenerate_covariance_a_tiny_step_or_a_flat_ranking():
     strategy, order, status, value = strategy_and_ranking(4)
     assert not stopped(strategy, order, status, value)
     strategy.eigenvalues[:] = 1.0, 2.0, 0.99e14
@@ -152,11 +149,11 @@ def test_it_stops_at_a_degenerate_covariance_a_tiny_step_or_a_flat_ranking() -> 
     assert not stopped(strategy, order, status, np.array([0.0, 0.0, 0.0, -np.inf]))
 
 
-def test_a_ranking_of_one_is_never_flat() -> None:
+def test_a_ranking_of_one_is_never_flat():
     assert not stopped(*strategy_and_ranking(1))
 
 
-def test_a_reset_strategy_is_a_new_one_around_its_mean() -> None:
+def test_a_reset_strategy_is_a_new_one_around_its_mean():
     random = np.random.default_rng(5)
     strategy, new = strategy_and_ranking(6)[0], strategy_around(np.ones(3), 6, 0.5)
     samples = np.zeros((6, 3))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -37,22 +36,22 @@ class Parameters(NamedTuple):
 class Quadratic:
     """Cost |A (x - c)|^2 over 9 dimensions; the measures are the last coordinates but one."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.model = Parameters(np.linspace(-0.3, 0.3, 9), np.linspace(1.0, 3.0, 9))
         self.space_arrays = 0
 
-    def work(self) -> int:
+    def work(self):
         return 0
 
-    def costs(self, vectors: FloatArray) -> FloatArray:
+    def costs(self, vectors):
         return ((self.model.weights * (vectors - self.model.centre)) ** 2).sum(axis=1)
 
-    def costs_and_gradients(self, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def costs_and_gradients(self, vectors):
         return self.costs(vectors), 2.0 * self.model.weights**2 * (vectors - self.model.centre)
 
 
 @numba.njit
-def cost_of(model, space, vector, work):  # type: ignore[no-untyped-def]
+def cost_of(model, space, vector, work):
     total = 0.0
     for j in range(9):
         total += (model.weights[j] * (vector[j] - model.centre[j])) ** 2
@@ -60,25 +59,25 @@ def cost_of(model, space, vector, work):  # type: ignore[no-untyped-def]
 
 
 @numba.njit
-def cost_and_gradient_of(model, space, vector, gradient, work):  # type: ignore[no-untyped-def]
+def cost_and_gradient_of(model, space, vector, gradient, work):
     for j in range(9):
         gradient[j] = 2.0 * model.weights[j] ** 2 * (vector[j] - model.centre[j])
     return cost_of(model, space, vector, work)
 
 
 @numba.njit
-def measures_of(space, measure, vector, out):  # type: ignore[no-untyped-def]
+def measures_of(space, measure, vector, out):
     out[0], out[1] = vector[6], vector[7]
 
 
 @numba.njit
-def measure_gradients_of(space, measure, vector, out):  # type: ignore[no-untyped-def]
+def measure_gradients_of(space, measure, vector, out):
     out[:] = 0.0
     out[0, 6] = out[1, 7] = 1.0
 
 
 @pytest.fixture(scope="module", autouse=True)
-def searches_of_the_quadratic(searches_around: Callable[..., None]) -> None:
+def searches_of_the_quadratic(searches_around):
     searches_around(cost_of, cost_and_gradient_of, measures_of, measure_gradients_of)
 
 
@@ -86,7 +85,7 @@ MEASURE = Measure(("x", "y"), MeasureCode(VECTOR, 2, 6))
 START = np.linspace(0.4, -0.2, 9)
 
 
-def search(name: str, seed: int, **settings: Any) -> GridArchive:
+def search(name, seed, **settings):
     """Our search on the quadratic."""
     archive = GridArchive(MEASURE, LOWER, UPPER, bins=BINS, dimension=9)
     quadratic: Any = Quadratic()
@@ -105,11 +104,11 @@ class SharedNormals:
     sign that turns pyribs' eigenvector into ours, of which the largest entry is positive.
     """
 
-    def __init__(self, strategy: Any, normals: FloatArray) -> None:
+    def __init__(self, strategy, normals):
         self._strategy = strategy
         self._rows = iter(normals)
 
-    def normal(self, mean: float, sigma: float, shape: tuple[int, int]) -> FloatArray:
+    def normal(self, mean, sigma, shape):
         rows = next(self._rows)
         assert rows.shape == shape
         basis = self._strategy.cov.eigenbasis
@@ -118,14 +117,14 @@ class SharedNormals:
         return mean + sigma * rows * signs
 
 
-def ribs_archive() -> Any:
+def ribs_archive():
     ranges = list(zip(LOWER, UPPER, strict=True))
     return ribs_archives.GridArchive(
         solution_dim=9, dims=[BINS, BINS], ranges=ranges, qd_score_offset=-100.0, epsilon=1e-6
     )
 
 
-def ribs_emitter(name: str, archive: Any, seed: int, sigma0: float) -> Any:
+def ribs_emitter(name, archive, seed, sigma0):
     common = {
         "x0": START,
         "sigma0": sigma0,
@@ -141,7 +140,7 @@ def ribs_emitter(name: str, archive: Any, seed: int, sigma0: float) -> Any:
     return ribs_emitters.GradientArborescenceEmitter(archive, lr=0.05, **adam, **common)
 
 
-def ribs_search(name: str, seed: int, sigma0: float) -> Any:
+def ribs_search(name, seed, sigma0):
     """The same search by pyribs with our random numbers."""
     quadratic: Any = Quadratic()
     archive = ribs_archive()
@@ -152,7 +151,7 @@ def ribs_search(name: str, seed: int, sigma0: float) -> Any:
     emitter._opt._rng = SharedNormals(emitter._opt, drawn)
     elites = key.stream(Purpose.RESTART).random(ITERATIONS)
 
-    def our_elite(count: int, **_: Any) -> dict[str, FloatArray]:
+    def our_elite(count, **_):
         data = archive.data(["solution", "index"], return_type="dict")
         order = np.argsort(data["index"])
         chosen = order[int(elites[iteration] * len(order))]
@@ -178,8 +177,8 @@ def ribs_search(name: str, seed: int, sigma0: float) -> Any:
     ("name", "sigma0"), [("cma_mega", 1.0), ("cma_mega", 0.1), ("cma_me", 0.2)]
 )
 def test_with_its_formulas_and_shared_random_numbers_the_archive_is_that_of_pyribs(
-    name: str, sigma0: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    name, sigma0, monkeypatch
+):
     # pyribs adds Adam's epsilon before the bias correction; without it the two are one formula.
     monkeypatch.setattr(chsel.qd.emitters, "mega_search", partial(mega_search, epsilon=0.0))
     ours = search(name, 3, sigma0=sigma0, ribs_parity=True)

@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
-from chsel.numerics.arrays import FloatArray
+from chsel import KnownPoints, RegistrationProblem, Workspace
 from chsel.problem.poses import Poses, compose, inverse
 from chsel.problem.search_space import search_space
 from chsel.problem.streams import StreamKey
-from chsel.qd.archive import Evaluated, GridArchive
+from chsel.qd.archive import Evaluated
 from chsel.qd.measures import MEASURES
 from chsel.qd.selection import (
     ArchiveSettings,
@@ -25,7 +24,7 @@ from tests.chsel.samples import ball_grid
 COSTS = np.array([3.0, 0.1, 9.0, 0.2, 0.4, 0.6])
 
 
-def problem_of(count: int, sdf: SdfGrid | None = None) -> RegistrationProblem:
+def problem_of(count, sdf=None):
     """One of so many hypotheses and 10 known points, in a workspace of a metre."""
     return RegistrationProblem(
         ball_grid(0.05, 0.02, 5) if sdf is None else sdf,
@@ -42,40 +41,38 @@ LOWEST = OutputSettings(
 )
 
 
-def at(x: FloatArray) -> FloatArray:
+def at(x):
     """Transforms (B, 4, 4) of an object at (x, 0.5, 0.5), x (B,)."""
     position = np.stack([x, np.full(len(x), 0.5), np.full(len(x), 0.5)], axis=1)
     return inverse(compose(np.tile(np.eye(3), (len(x), 1, 1)), position))
 
 
-def selected(
-    costs: FloatArray, x: FloatArray, count: int, *, sdf: SdfGrid | None = None, **changes: object
-) -> list[int]:
+def selected(costs, x, count, *, sdf=None, **changes):
     """Which elites with such costs (C,), at x (C,), are chosen."""
-    settings = replace(LOWEST, **changes)  # type: ignore[arg-type]
+    settings = replace(LOWEST, **changes)
     problem, stream = problem_of(count, sdf), np.random.default_rng(0)
     space = search_space(None, problem.sdf)
     return select_elites(costs, Poses.of(at(x)), problem, space, settings, stream).tolist()
 
 
-def chosen(count: int, **changes: Any) -> list[int]:
+def chosen(count, **changes):
     return selected(COSTS, np.full(len(COSTS), 0.5), count, **changes)
 
 
-def test_the_lowest_costs_are_chosen_in_their_order() -> None:
+def test_the_lowest_costs_are_chosen_in_their_order():
     assert chosen(3, limit="none") == [1, 3, 4]
 
 
-def test_paper_returns_fewer_when_the_archive_holds_fewer() -> None:
+def test_paper_returns_fewer_when_the_archive_holds_fewer():
     assert chosen(9, limit="none", shortage="fewer") == [1, 3, 4, 5, 0, 2]
 
 
-def test_next_best_cells_come_before_copies() -> None:
+def test_next_best_cells_come_before_copies():
     assert chosen(5, limit="ratio") == [1, 3, 4, 5, 0]
     assert chosen(8, limit="ratio") == [1, 1, 3, 3, 4, 5, 0, 2]
 
 
-def test_reference_resamples_within_five_times_the_best() -> None:
+def test_reference_resamples_within_five_times_the_best():
     drawn = chosen(200, limit="ratio", shortage="resample")
     assert set(drawn) == {1, 3, 4}
     assert COSTS[drawn].tolist() == sorted(COSTS[drawn])
@@ -83,20 +80,20 @@ def test_reference_resamples_within_five_times_the_best() -> None:
     assert chosen(2, limit="ratio", shortage="resample") == [1, 3]
 
 
-def test_noise_limit_is_lowest_plus_tolerance_where_that_is_larger() -> None:
+def test_noise_limit_is_lowest_plus_tolerance_where_that_is_larger():
     changes = {"limit": "noise", "shortage": "fewer", "free_tolerance": 0.5}
     assert chosen(9, tolerance_per_point=0.001, **changes) == [1, 3, 4, 5]
     assert chosen(9, tolerance_per_point=0.5, **changes) == [1, 3, 4, 5, 0]
 
 
-def archive_of(values: FloatArray, costs: FloatArray, settings: ArchiveSettings) -> GridArchive:
+def archive_of(values, costs, settings):
     """The archive that estimates of such measures (B, 2) and costs (B,) size."""
     measure, estimates = MEASURES["position_2"], Evaluated(np.zeros((len(costs), 9)), costs, values)
     return sized_archive(estimates, measure, settings, known_count=5, dimension=9)
 
 
 @pytest.mark.parametrize(("outliers", "kept"), [("none", 5), ("ratio", 3), ("quantile", 4)])
-def test_outliers_do_not_widen_the_archive(outliers: str, kept: int) -> None:
+def test_outliers_do_not_widen_the_archive(outliers, kept):
     costs = np.array([0.1, 0.2, 0.3, 0.9, 50.0])
     values = np.array([[0.0, 0.0], [0.2, 0.1], [0.4, -0.1], [1.0, 1.0], [30.0, 30.0]])
     settings = ArchiveSettings(outliers=outliers, tolerance_per_point=0.0, bins=10)
@@ -107,13 +104,13 @@ def test_outliers_do_not_widen_the_archive(outliers: str, kept: int) -> None:
     assert archive.shape == (10, 10)
 
 
-def test_equal_estimates_still_make_an_archive_of_some_width() -> None:
+def test_equal_estimates_still_make_an_archive_of_some_width():
     values = np.tile([0.3, 0.2], (6, 1))
     archive = archive_of(values, np.ones(6), ArchiveSettings())
     np.testing.assert_allclose(archive.upper - archive.lower, 2 * 3 * 0.005)
 
 
-def test_repetitions_are_flagged_after_the_first() -> None:
+def test_repetitions_are_flagged_after_the_first():
     poses = np.stack([np.eye(4), 2 * np.eye(4), np.eye(4), 2 * np.eye(4), 3 * np.eye(4)])
     assert repeated(Poses.of(poses)).tolist() == [False, False, True, True, False]
     assert repeated(Poses.of(poses[:0])).tolist() == []
@@ -124,7 +121,7 @@ RISING = np.linspace(0.0, 0.011, len(GROUPS))  # costs: the first group has the 
 NEAR: dict[str, Any] = {"tolerance_per_point": 0.002, "free_tolerance": 0.0}  # a limit of 0.02
 
 
-def test_representatives_are_of_all_groups_below_the_limit() -> None:
+def test_representatives_are_of_all_groups_below_the_limit():
     lowest = selected(RISING, GROUPS, 3, **NEAR)
     assert lowest == [0, 1, 2]
     representative = selected(RISING, GROUPS, 3, choice="representative", **NEAR)
@@ -134,7 +131,7 @@ def test_representatives_are_of_all_groups_below_the_limit() -> None:
     assert sorted({i // 4 for i in below}) == [0, 1]
 
 
-def test_as_many_representatives_as_wanted_however_many_there_are() -> None:
+def test_as_many_representatives_as_wanted_however_many_there_are():
     x = np.linspace(0.0, 1.0, 3000)
     costs = np.linspace(0.0, 0.01, 3000)
     for count in (1, 30, 700):
@@ -145,24 +142,24 @@ def test_as_many_representatives_as_wanted_however_many_there_are() -> None:
         assert gaps.max() < 2.5 / count + 0.01
 
 
-def test_of_poses_that_are_alike_as_many_are_chosen() -> None:
+def test_of_poses_that_are_alike_as_many_are_chosen():
     costs = np.linspace(0.0, 0.01, 40)
     alike = selected(costs, np.full(40, 0.3), 5, choice="representative", **NEAR)
     assert len(set(alike)) == 5
     assert alike[0] == 0
 
 
-def test_lowest_are_chosen_where_too_few_are_below_the_limit() -> None:
+def test_lowest_are_chosen_where_too_few_are_below_the_limit():
     costs = np.where(GROUPS < 0.2, RISING, 1.0 + RISING)
     assert selected(costs, GROUPS, 6, choice="representative", **NEAR) == [0, 1, 2, 3, 4, 5]
 
 
-def test_lowest_are_chosen_of_an_object_without_a_surface() -> None:
+def test_lowest_are_chosen_of_an_object_without_a_surface():
     thin = ball_grid(-0.01, 0.02, 5)
     assert selected(RISING, GROUPS, 3, sdf=thin, choice="representative", **NEAR) == [0, 1, 2]
 
 
-def test_poses_beside_the_workspace_are_not_chosen_unless_all_are() -> None:
+def test_poses_beside_the_workspace_are_not_chosen_unless_all_are():
     x = np.array([1.3, 0.2, -0.3, 1.1, 0.9, 7.0])
     assert selected(COSTS, x, 3) == [1, 3, 4]
     assert selected(COSTS, x, 3, margin=0.15) == [1, 3, 4]

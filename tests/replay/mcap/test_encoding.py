@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from chsel.errors import RecordingError
-from replay.mcap.encoding import Kind, decode, encode, field_kinds, message_class
+from replay.mcap.encoding import decode, encode, field_kinds, message_class
 from replay.mcap.foxglove_messages import cloud_points, point_cloud
 from replay.mcap.schemas import MESSAGES
 from tests.replay.conftest import same_bits
@@ -41,13 +41,13 @@ ARCHIVE = {
 
 
 @st.composite
-def values_of(draw: st.DrawFn, name: str) -> dict[str, Any]:
+def values_of(draw, name):
     """Any values that a message of the table can have."""
     lengths: dict[str, int] = {}
     return {field: draw(_value(kind, lengths, draw)) for field, kind in field_kinds(name).items()}
 
 
-def _value(kind: Kind, lengths: dict[str, int], draw: st.DrawFn) -> st.SearchStrategy[Any]:
+def _value(kind, lengths, draw):
     if kind.dtype is not None:
         shape = tuple(
             int(side)
@@ -68,7 +68,7 @@ def _value(kind: Kind, lengths: dict[str, int], draw: st.DrawFn) -> st.SearchStr
     return st.one_of(st.none(), found) if kind.optional else found
 
 
-def native(value: Any) -> Any:
+def native(value):
     """Arrays in the machine's byte order and in C order, as a reader gets them."""
     if isinstance(value, dict):
         return {name: native(item) for name, item in value.items()}

@@ -1,10 +1,7 @@
 """What the reader gives back, and how it meets files that are not what they should be."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +20,7 @@ from tests.replay.conftest import nth
 Change = Callable[[str, bytes], bytes | None]
 
 
-def rewritten(path: Path, change: Change) -> Path:
+def rewritten(path, change):
     """A whole, checksummed copy of a recording with other messages or attachments.
 
     change: gets topic or attachment name and the bytes; gives new bytes, or None to leave out.
@@ -54,10 +51,10 @@ def rewritten(path: Path, change: Change) -> Path:
     return copy
 
 
-def edited(topic: str, **values) -> Change:
+def edited(topic, **values):
     """A change of some fields of all messages of a topic."""
 
-    def change(name: str, data: bytes) -> bytes:
+    def change(name, data):
         return (
             encode(RECORDS[name], decode(RECORDS[name], data) | values) if name == topic else data
         )
@@ -148,7 +145,7 @@ def test_an_event_cut_from_its_points_is_left_out(events, write, assert_same):
     path = write(events[:3])
     seen = []
 
-    def without_the_last_points(topic: str, data: bytes) -> bytes | None:
+    def without_the_last_points(topic, data):
         seen.append(topic)
         return None if topic == "/known_points" and seen.count(topic) == 2 else data
 
@@ -175,12 +172,12 @@ def test_other_files_are_refused(tmp_path):
             read_recording(path)
 
 
-def drop(*names: str) -> Change:
+def drop(*names):
     return lambda name, data: None if name in names else data
 
 
 def test_another_format_version_is_named_before_all_else(events, write):
-    def newer(name: str, data: bytes) -> bytes:
+    def newer(name, data):
         if name != "/session":
             return data
         session = message_class("Session").FromString(data)

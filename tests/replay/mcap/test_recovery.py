@@ -7,9 +7,6 @@ import io
 import json
 import struct
 from collections import Counter
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -22,7 +19,6 @@ from replay.__main__ import main
 from replay.comparing.verification import EQUAL, NO_RESULT, verify
 from replay.events import (
     Decided,
-    Event,
     HypothesesFound,
     Measured,
     Probe,
@@ -33,7 +29,7 @@ from replay.events import (
 )
 from replay.mcap.log_file import RawFile
 from replay.mcap.reader import read_recording
-from replay.mcap.recovery import Recovered, recover, tells_loss
+from replay.mcap.recovery import recover, tells_loss
 from replay.mcap.writer import McapRecorder
 from replay.verbs.info import log_info, recording_info
 from tests.replay.conftest import example_events, nth, same_bits
@@ -41,7 +37,7 @@ from tests.runners.sensors.small_logs import ros2_sent, write_ros2
 from tests.tools.small_recordings import registered_session
 
 
-def recorded(path: Path, events: list[Event], *flush_before: type[Event]) -> bytes:
+def recorded(path, events, *flush_before):
     """A recording of events with a chunk for each probe, as a session leaves it."""
     recorder, flushed = McapRecorder(path), -1
     for event in events:
@@ -54,7 +50,7 @@ def recorded(path: Path, events: list[Event], *flush_before: type[Event]) -> byt
     return path.read_bytes()
 
 
-def chunks_of(data: bytes, topic: str | None = None) -> list[tuple[int, int]]:
+def chunks_of(data, topic=None):
     """Start and end of every chunk, or of those with messages on a topic."""
     summary = make_reader(io.BytesIO(data)).get_summary()
     assert summary is not None
@@ -66,7 +62,7 @@ def chunks_of(data: bytes, topic: str | None = None) -> list[tuple[int, int]]:
     ]
 
 
-def recovered(folder: Path, data: bytes) -> tuple[list[Event], Recovered]:
+def recovered(folder, data):
     """The events that come back of a file with these bytes, strictly read, and the report."""
     damaged, out = folder / "damaged.mcap", folder / "recovered.mcap"
     damaged.write_bytes(data)
@@ -77,7 +73,7 @@ def recovered(folder: Path, data: bytes) -> tuple[list[Event], Recovered]:
     return list(read_recording(out).events()), found
 
 
-def without_marks(events: list[Event]) -> list[Event]:
+def without_marks(events):
     """What was in the damaged file: events without the warnings and the end that were added."""
     kept = [event for event in events if not tells_loss(event)]
     if isinstance(kept[-1], SessionEnded) and "recovered: " in kept[-1].outcome:
@@ -85,16 +81,16 @@ def without_marks(events: list[Event]) -> list[Event]:
     return kept
 
 
-def probes(events: list[Event]) -> list[Event]:
+def probes(events):
     return [event for event in events if isinstance(event, Probe)]
 
 
-def flipped(data: bytes, start: int, end: int) -> bytes:
+def flipped(data, start, end):
     middle = (start + end) // 2
     return data[:middle] + bytes([data[middle] ^ 16]) + data[middle + 1 :]
 
 
-def wrong_length(data: bytes, start: int, _: int) -> bytes:
+def wrong_length(data, start, _):
     return data[: start + 1] + struct.pack("<Q", 2**40) + data[start + 9 :]
 
 
@@ -215,14 +211,14 @@ examples = settings(
 
 
 @st.composite
-def damages(draw: st.DrawFn) -> Callable[[bytes], bytes]:
+def damages(draw):
     """Up to three damages: bits flipped, bytes zeroed, removed or put in, or all cut off."""
     kinds = st.sampled_from(["flip", "flip", "zero", "remove", "insert", "cut"])
     places = st.floats(0.0, 1.0, exclude_max=True) | st.floats(0.97, 1.0, exclude_max=True)
     one = st.tuples(kinds, places, st.sampled_from([1, 4, 60, 300, 4096]))
     drawn = draw(st.lists(one, min_size=1, max_size=3))
 
-    def damage(data: bytes) -> bytes:
+    def damage(data):
         for kind, place, length in drawn:
             if not data:
                 break
@@ -256,7 +252,7 @@ def log(tmp_path_factory):
     return data, Counter(RawFile(path).messages(None, lambda fault: None))
 
 
-def answer(path: Path, question: Callable[[], Any]) -> Any:
+def answer(path, question):
     """What comes back, or the text of an error, which has to name the file on one line."""
     try:
         return question()
@@ -267,7 +263,7 @@ def answer(path: Path, question: Callable[[], Any]) -> Any:
     return text
 
 
-def same(read: list[Event], written: list[Event]) -> bool:
+def same(read, written):
     return len(read) == len(written) and all(map(same_bits, read, written))
 
 

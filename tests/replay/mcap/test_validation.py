@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from contextlib import nullcontext
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,47 +37,47 @@ Events = list[Event]
 Change = Callable[[Events], Events]
 
 
-def first(kind: type, /, **values: Any) -> Change:
+def first(kind, /, **values):
     """Other values of the first event of a kind."""
     return lambda events: changed(events, nth(events, kind), **values)
 
 
-def result(make: Callable[[Any], dict[str, Any]]) -> Change:
+def result(make):
     """Other values of the first result, made of the old ones."""
 
-    def change(events: Events) -> Events:
+    def change(events):
         old = nth(events, HypothesesFound).hypotheses
         return first(HypothesesFound, hypotheses=dataclasses.replace(old, **make(old)))(events)
 
     return change
 
 
-def archive(**values: Any) -> Change:
+def archive(**values):
     """Other values of the archive of the first result."""
     return result(lambda found: {"archive": dataclasses.replace(found.archive, **values)})
 
 
-def inserted(place: int, event: Event) -> Change:
+def inserted(place, event):
     return lambda events: [*events[:place], event, *events[place:]]
 
 
-def before(kind: type, event: Event) -> Change:
+def before(kind, event):
     return lambda events: inserted(events.index(nth(events, kind)), event)(events)
 
 
-def repeated(kind: type) -> Change:
+def repeated(kind):
     return lambda events: before(kind, nth(events, kind))(events)
 
 
-def moved(kind: type, behind: type) -> Change:
-    def change(events: Events) -> Events:
+def moved(kind, behind):
+    def change(events):
         event = nth(events, kind)
         return before(behind, event)([other for other in events if other is not event])
 
     return change
 
 
-def without(kind: type) -> Change:
+def without(kind):
     return lambda events: [event for event in events if not isinstance(event, kind)]
 
 
@@ -156,7 +155,7 @@ def test_pixels_of_another_kind_are_refused(robot, write):
 
 
 def test_a_diverged_start_of_infinite_cost_is_a_result(robot, write, assert_same):
-    def diverged(found: Any) -> dict[str, Any]:
+    def diverged(found):
         cost, poses = found.cost.copy(), found.object_from_world.copy()
         cost[-1], poses[-1, :3] = np.inf, np.nan
         return {"cost": cost, "object_from_world": poses}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,13 +26,13 @@ from tests.replay.conftest import example_events, nth
 LAYOUT = Path(replay.__file__).parent / "foxglove_layout.json"
 
 
-def messages(path: Path, *topics: str) -> list[tuple[str, int, bytes]]:
+def messages(path, *topics):
     with path.open("rb") as file:
         found = make_reader(file, validate_crcs=True).iter_messages(topics or None)
         return [(channel.topic, message.log_time, message.data) for _, channel, message in found]
 
 
-def positions(cloud: bytes) -> np.ndarray:
+def positions(cloud):
     """What a viewer reads: x, y, z where the fields say that they are."""
     parsed = PointCloud.FromString(cloud)
     assert [field.name for field in parsed.fields[:3]] == ["x", "y", "z"]
@@ -41,7 +40,7 @@ def positions(cloud: bytes) -> np.ndarray:
     return np.ascontiguousarray(rows[:, :12]).view("<f4")
 
 
-def placed(mesh: Any) -> np.ndarray:
+def placed(mesh):
     """The points of a mesh of a scene, moved by its pose."""
     p, q = mesh.pose.position, mesh.pose.orientation
     rotation = rotation_matrices(np.array([[q.x, q.y, q.z, q.w]]))[0]

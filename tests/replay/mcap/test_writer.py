@@ -1,7 +1,5 @@
 """What the writer puts into a file, and what becomes of it when the process does not end well."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import subprocess
@@ -22,7 +20,7 @@ from tests.replay.conftest import changed, example_events, nth
 CONFTEST = Path(__file__).parents[1] / "conftest.py"
 
 
-def run_script(script: str, path: Path, hash_seed: str = "0") -> subprocess.CompletedProcess[str]:
+def run_script(script, path, hash_seed="0"):
     """Run a script that finds the example's functions in `example` and a path in `path`."""
     head = f"import runpy; example = runpy.run_path({str(CONFTEST)!r}); path = {str(path)!r}\n"
     return subprocess.run(
@@ -35,7 +33,7 @@ def run_script(script: str, path: Path, hash_seed: str = "0") -> subprocess.Comp
     )
 
 
-def messages(path: Path, *topics: str) -> list:
+def messages(path, *topics):
     with path.open("rb") as file:
         found = make_reader(file, validate_crcs=True).iter_messages(
             topics or None, None, None, False

@@ -1,7 +1,5 @@
 """The comparison of methods, read back with Rerun's own reader."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,7 @@ from chsel.problem.poses import compose, inverse
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.trust import trust_in
 from replay.comparing.comparison import common_cost, numbers_under
-from replay.mcap.reader import Recording, read_recording
+from replay.mcap.reader import read_recording
 from replay.rerun.comparison_view import ranked, save_comparison
 from tests.replay.conftest import example_events
 from tests.replay.rerun.test_recorder import shown_poses
@@ -43,7 +41,7 @@ def results(recording):
     return {"chsel": first, AWKWARD: {1: one}}
 
 
-def judge_of(recording: Recording, step: int) -> CompiledCost:
+def judge_of(recording, step):
     return CompiledCost.of(recording.problem(step), common_cost(recording).settings)
 
 

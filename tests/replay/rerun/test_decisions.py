@@ -1,9 +1,6 @@
 """Decisions of a steered session in the Rerun recording, read back with Rerun's own reader."""
 
-from __future__ import annotations
-
 import dataclasses
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -13,7 +10,7 @@ from chsel.next_probe.decision_problem import Actions, Belief, Decision, Decisio
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import compose
 from chsel.problem.streams import StreamKey
-from replay.events import ActionsOffered, Decided, Event, Probe, SessionEnded
+from replay.events import ActionsOffered, Decided, Probe, SessionEnded
 from tests.replay.rerun.test_recorder import ALONG_X, SDF, WORKSPACE, started, write
 from tests.tools.rrd_rows import read, shown_at
 
@@ -27,7 +24,7 @@ ACTIONS = Actions(
 HAND = HandShape.of(trimesh.creation.box(extents=(0.02, 0.04, 0.1)))
 
 
-def decided(step: int, chosen: int, score: list[float], stop: str = "") -> Decided:
+def decided(step, chosen, score, stop=""):
     problem = DecisionProblem(
         sdf=SDF,
         points=KnownPoints(),
@@ -53,14 +50,14 @@ def decided(step: int, chosen: int, score: list[float], stop: str = "") -> Decid
     return Decided(step, problem, decision, surprise=0.5 * (step + 1))
 
 
-def probe(step: int, *, hit: bool) -> Probe:
+def probe(step, *, hit):
     path = compose(np.tile(np.eye(3), (2, 1, 1)), np.array([[0.0, 0.0, -0.6], [0.0, 0.0, -0.3]]))
     contacts = np.array([[0.0, 0.0, -0.15]]) if hit else np.zeros((0, 3))
     points = KnownPoints(free=np.full((1, 3), 0.1 * step), known=contacts)
     return Probe(step, "contact" if hit else "free", points, gripper_path=path, contacts=contacts)
 
 
-def session() -> Iterator[Event]:
+def session():
     yield dataclasses.replace(started(None), initial_points=KnownPoints())
     yield ActionsOffered(-1, ACTIONS, HAND)
     yield decided(-1, 0, [3.0, 1.0, 2.0])

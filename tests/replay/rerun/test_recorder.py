@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +15,6 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from replay.colors import CostScale
 from replay.events import (
-    Event,
     HypothesesFound,
     Measured,
     Probe,
@@ -34,7 +31,7 @@ from replay.rerun import viewer as rerun_viewer
 from replay.rerun.rerun_recorder import RerunRecorder
 from replay.rerun.scene import LEVELS, cost_levels
 from replay.rerun.sensors import display_size
-from tests.tools.rrd_rows import Row, at_probe, read, shown_at
+from tests.tools.rrd_rows import at_probe, read, shown_at
 
 WORKSPACE = Workspace((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
 MESH = trimesh.creation.box(extents=(0.1, 0.2, 0.3))
@@ -47,7 +44,7 @@ CAMERA = compose(np.diag([1.0, -1.0, -1.0]), np.array([0.1, 0.2, 0.9]))
 INTRINSICS = np.array([8.0, 9.0, 2.5, 1.5])
 
 
-def started(world_from_object: np.ndarray | None = TRUTH) -> SessionStarted:
+def started(world_from_object=TRUTH):
     return SessionStarted(
         runner="probe",
         object="box",
@@ -64,7 +61,7 @@ def started(world_from_object: np.ndarray | None = TRUTH) -> SessionStarted:
     )
 
 
-def probe(step: int) -> Probe:
+def probe(step):
     rng = np.random.default_rng(step)
     contacts = rng.uniform(-0.1, 0.1, (1 + step, 3))
     ways = [[-0.4, 0.0, 0.0], [-0.2, 0.9, 0.0], [-0.1, 0.0, 0.01 * step], [-0.3, 0.0, 0.0]]
@@ -79,7 +76,7 @@ def probe(step: int) -> Probe:
     return Probe(step, "contact", points, path, contacts, normals)
 
 
-def snapshot(iteration: int, shape: tuple[int, ...] = (4, 3)) -> ArchiveSnapshot:
+def snapshot(iteration, shape=(4, 3)):
     cells, axes = np.arange(iteration + 2), len(shape)
     return ArchiveSnapshot(
         iteration,
@@ -95,14 +92,14 @@ def snapshot(iteration: int, shape: tuple[int, ...] = (4, 3)) -> ArchiveSnapshot
     )
 
 
-def hypotheses(archive: ArchiveSnapshot) -> Hypotheses:
+def hypotheses(archive):
     rng, count = np.random.default_rng(6), 6
     poses = compose(random_rotations(rng, count), rng.uniform(-0.2, 0.2, (count, 3)))
     cost = 1.5 * np.arange(1, count + 1, dtype=np.float64) ** 2
     return Hypotheses(poses, cost, np.arange(count) % 4 == 2, np.arange(count), poses, archive)
 
 
-def registration(step: int, *, shape: tuple[int, ...] = (4, 3)) -> Iterator[Event]:
+def registration(step, *, shape=(4, 3)):
     problem = RegistrationProblem(
         SDF, INITIAL, np.eye(4)[None], WORKSPACE, 0.025, StreamKey(3, step)
     )
@@ -121,19 +118,19 @@ def registration(step: int, *, shape: tuple[int, ...] = (4, 3)) -> Iterator[Even
     yield Timed(step, {"gradient_descent": 0.25})
 
 
-def depth(step: int, *, height: int = 4, width: int = 6) -> SensorImage:
+def depth(step, *, height=4, width=6):
     values = np.arange(height * width, dtype=np.uint16).reshape(height, width) * 50
     return SensorImage(step, "camera", "depth", values, 0.001, values > 200, INTRINSICS, CAMERA)
 
 
-def touch(step: int, pixels: int) -> SensorImage:
+def touch(step, pixels):
     values = np.zeros((3, 5), dtype=np.uint16)
     values.flat[:pixels] = 60
     seen = (values, 0.0001, values > 40, INTRINSICS, CAMERA)
     return SensorImage(step, "pad_1", "deformation", *seen)
 
 
-def session() -> Iterator[Event]:
+def session():
     """Three probes, with two images of a camera before each; the pad tells nothing of the last."""
     yield started()
     yield RigDescribed(-1, "cabinet", "0a1b", HAND)
@@ -145,7 +142,7 @@ def session() -> Iterator[Event]:
     yield SessionEnded(2, "finished")
 
 
-def write(path: Path, events: Iterable[Event]) -> Path:
+def write(path, events):
     recorder = RerunRecorder(path)
     for event in events:
         recorder.record(event)
@@ -153,7 +150,7 @@ def write(path: Path, events: Iterable[Event]) -> Path:
     return path
 
 
-def shown_poses(rows: dict[str, list[Row]], root: str, step: int) -> dict[float, np.ndarray]:
+def shown_poses(rows, root, step):
     """The poses (4, 4) at which hypotheses are shown at a probe, by their costs."""
     poses: dict[float, np.ndarray] = {}
     for entity in ("best", *(f"cost_step_{level + 1}" for level in range(LEVELS))):
@@ -208,7 +205,7 @@ def test_every_distinct_hypothesis_is_drawn_once_at_its_pose(rows):
             np.testing.assert_allclose(pose, world_from_object, atol=1e-6)
 
 
-def images(rows: list[Row], step: int, dtype: type, channels: int) -> list[np.ndarray]:
+def images(rows, step, dtype, channels):
     """The pictures of a probe, each in the format that was given last."""
     found, shape = [], (0, 0)
     for times, row in rows:

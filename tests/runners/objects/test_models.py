@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import igl
@@ -30,7 +28,7 @@ SCANS = {
 }
 
 
-def _distances(source: trimesh.Trimesh, target: trimesh.Trimesh) -> np.ndarray:
+def _distances(source, target):
     points, _ = trimesh.sample.sample_surface(source, 5000, seed=0)
     vertices = np.array(target.vertices, dtype=np.float64)
     squared, *_ = igl.point_mesh_squared_distance(
@@ -39,14 +37,14 @@ def _distances(source: trimesh.Trimesh, target: trimesh.Trimesh) -> np.ndarray:
     return np.sqrt(squared)
 
 
-def _is_inside(mesh: trimesh.Trimesh, points: Sequence[Sequence[float]]) -> list[bool]:
+def _is_inside(mesh, points):
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64)
     winding = igl.winding_number(vertices, faces, np.array(points) * 1e-3)
     return (winding > 0.5).tolist()
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_a_model_is_one_closed_body_of_the_scans_size(name: str) -> None:
+def test_a_model_is_one_closed_body_of_the_scans_size(name):
     model = load_model(name)
     assert model.is_watertight
     assert model.is_volume
@@ -57,7 +55,7 @@ def test_a_model_is_one_closed_body_of_the_scans_size(name: str) -> None:
     assert model.volume * 1e6 == pytest.approx(SCANS[name].volume, rel=0.03)
 
 
-def test_the_drill_has_a_body_a_chuck_a_handle_and_a_foot_with_space_between_them() -> None:
+def test_the_drill_has_a_body_a_chuck_a_handle_and_a_foot_with_space_between_them():
     drill = load_model("drill")
     chuck, body, handle, foot = [72, 65, 161], [-40, -5, 155], [-18, 3, 75], [35, 35, 15]
     assert _is_inside(drill, [chuck, body, handle, foot]) == [True] * 4
@@ -66,7 +64,7 @@ def test_the_drill_has_a_body_a_chuck_a_handle_and_a_foot_with_space_between_the
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_a_model_lies_close_to_its_scan(name: str, ycb_directory: Path) -> None:
+def test_a_model_lies_close_to_its_scan(name, ycb_directory):
     scan = trimesh.load_mesh(ycb_directory / SCANS[name].folder / "google_16k/nontextured.ply")
     model = load_model(name)
     np.testing.assert_allclose(model.extents, scan.extents, rtol=0.03)

@@ -1,7 +1,5 @@
 """Archives of scans: cut, unpacked, checked, placed."""
 
-from __future__ import annotations
-
 import io
 import tarfile
 from collections.abc import Callable
@@ -16,7 +14,7 @@ from runners.objects.scans import AssetsConfig, DownloadError, download_scan
 SCAN = "012_strawberry"
 
 
-def archive(mesh: trimesh.Trimesh, scan: str = SCAN) -> bytes:
+def archive(mesh, scan=SCAN):
     ply = mesh.export(file_type="ply")
     stream = io.BytesIO()
     with tarfile.open(fileobj=stream, mode="w:gz") as tar:
@@ -31,7 +29,7 @@ def archive(mesh: trimesh.Trimesh, scan: str = SCAN) -> bytes:
     return stream.getvalue()
 
 
-def open_box() -> trimesh.Trimesh:
+def open_box():
     mesh = trimesh.creation.box((0.1, 0.2, 0.3))
     mesh.update_faces(np.arange(12) > 0)
     return mesh
@@ -42,11 +40,11 @@ Serve = Callable[[bytes], AssetsConfig]
 
 
 @pytest.fixture
-def serve(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Serve:
+def serve(monkeypatch, tmp_path):
     """Hands some bytes out as the archive of any scan."""
 
-    def hold(content: bytes) -> AssetsConfig:
-        def retrieve(url: str, known_hash: None, path: str, downloader: object) -> str:
+    def hold(content):
+        def retrieve(url, known_hash, path, downloader):
             (Path(path) / "archive").write_bytes(content)
             return str(Path(path) / "archive")
 
@@ -56,7 +54,7 @@ def serve(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Serve:
     return hold
 
 
-def test_the_mesh_is_placed_as_in_the_official_archive_and_nothing_else(serve: Serve) -> None:
+def test_the_mesh_is_placed_as_in_the_official_archive_and_nothing_else(serve):
     assets = serve(BOX)
     assert download_scan(SCAN, assets) == "8 vertices, 100.0 x 200.0 x 300.0 mm"
     files = [path for path in assets.folder.parent.rglob("*") if path.is_file()]
@@ -74,13 +72,13 @@ def test_the_mesh_is_placed_as_in_the_official_archive_and_nothing_else(serve: S
     ],
     ids=["open", "another", "a page", "cut"],
 )
-def test_what_is_not_the_scan_leaves_nothing(serve: Serve, content: bytes, reason: str) -> None:
+def test_what_is_not_the_scan_leaves_nothing(serve, content, reason):
     assets = serve(content)
     with pytest.raises(DownloadError, match=rf"_google_16k\.tgz is not the archive .*{reason}"):
         download_scan(SCAN, assets)
     assert list(assets.folder.iterdir()) == []
 
 
-def test_no_server_at_all_is_reported(tmp_path: Path) -> None:
+def test_no_server_at_all_is_reported(tmp_path):
     with pytest.raises(DownloadError, match=r"refused.*; try again"):
         download_scan(SCAN, AssetsConfig(str(tmp_path), "http://127.0.0.1:1"))

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from importlib import import_module
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mcap.reader import make_reader
@@ -15,7 +12,7 @@ from mcap_ros2.decoder import DecoderFactory
 from tests.runners.sensors.small_logs import png
 
 
-def in_foxgloves_messages(source: Path, target: Path, *, packed: bool) -> Path:
+def in_foxgloves_messages(source, target, *, packed):
     """Write the messages of one log into another, at the same times on the same topics.
 
     Those without a counterpart are left out.
@@ -43,7 +40,7 @@ def in_foxgloves_messages(source: Path, target: Path, *, packed: bool) -> Path:
     return target
 
 
-def _made(kind: str, said: Any = None, **fields: Any) -> Any:
+def _made(kind, said=None, **fields):
     """A message of Foxglove's with the head of one of ROS 2."""
     if said is not None:
         stamp = said.header.stamp
@@ -54,7 +51,7 @@ def _made(kind: str, said: Any = None, **fields: Any) -> Any:
     return made(**{name: value for name, value in fields.items() if name in known})
 
 
-def _said_again(kind: str, said: Any, packed: bool) -> Iterator[Any]:
+def _said_again(kind, said, packed):
     match kind:
         case "TFMessage":
             moved = [_transform(one) for one in said.transforms]
@@ -93,15 +90,15 @@ def _said_again(kind: str, said: Any, packed: bool) -> Iterator[Any]:
             yield _made("PointCloud", said, pose=pose, point_stride=24, fields=fields, data=data)
 
 
-def _xyz(one: Any) -> dict[str, float]:
+def _xyz(one):
     return {name: getattr(one, name) for name in "xyzw" if hasattr(one, name)}
 
 
-def _pose(one: Any) -> dict[str, Any]:
+def _pose(one):
     return {"position": _xyz(one.position), "orientation": _xyz(one.orientation)}
 
 
-def _transform(one: Any) -> Any:
+def _transform(one):
     return _made(
         "FrameTransform",
         one,

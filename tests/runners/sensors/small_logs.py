@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
 from io import BytesIO
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +15,6 @@ from chsel.problem.poses import compose
 from chsel.sensing.depth_camera import PinholeCamera
 from replay.events import Logged, Probe
 from runners.sensors.log.ros2_definitions import DEFINITIONS, full_definition
-from runners.sensors.rig import Rig
 from runners.sessions.sensors import SensorsSession, SensorsSettings
 from runners.simulated_robot.log_writer import camera_info, header, image, joint_state, transform
 
@@ -27,9 +24,7 @@ BEGIN = 1_700_000_000 * SECOND
 Sent = tuple[str, str, Any, int]  # topic, type, message, log time
 
 
-def read(
-    path: Path, rig: Rig, diameter: float | None = None
-) -> tuple[SensorsSession, list[Probe], str]:
+def read(path, rig, diameter=None):
     """The session of a log, its probes, and what was told."""
     session = SensorsSession(SensorsSettings(rig, str(path)), 0, diameter=diameter)
     events = list(session.probes())
@@ -37,14 +32,7 @@ def read(
     return session, [event for event in events if isinstance(event, Probe)], told
 
 
-def write_ros2(
-    path: Path,
-    sent: Sequence[Sent],
-    *,
-    chunk_size: int = 2000,
-    compression: CompressionType = CompressionType.ZSTD,
-    finished: bool = True,
-) -> bytes:
+def write_ros2(path, sent, *, chunk_size=2000, compression=CompressionType.ZSTD, finished=True):
     """A ROS 2 log; its bytes."""
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=chunk_size, compression=compression)
@@ -59,7 +47,7 @@ def write_ros2(
     return path.read_bytes()
 
 
-def ros2_cloud(points: np.ndarray, stamp: int) -> dict[str, Any]:
+def ros2_cloud(points, stamp):
     """A sensor_msgs/PointCloud2 of one row of points (N, 3), as float64."""
     fields = [{"name": n, "offset": 8 * k, "datatype": 8, "count": 1} for k, n in enumerate("xyz")]
     return {
@@ -74,24 +62,24 @@ def ros2_cloud(points: np.ndarray, stamp: int) -> dict[str, Any]:
     }
 
 
-def png(values: np.ndarray) -> bytes:
+def png(values):
     """A grey PNG, of 8 or 16 bits as the values (H, W) are."""
     file = BytesIO()
     Image.fromarray(values).save(file, "PNG")
     return file.getvalue()
 
 
-def depth(seed: int = 0) -> np.ndarray:
+def depth(seed=0):
     """A depth image (3, 5), millimetres."""
     return np.random.default_rng(seed).integers(300, 900, (3, 5)).astype(np.uint16)
 
 
-def xyz(*numbers: float) -> dict[str, float]:
+def xyz(*numbers):
     """A vector, or a quaternion."""
     return dict(zip("xyzw", numbers, strict=False))
 
 
-def ros2_sent(count: int = 4) -> list[Sent]:
+def ros2_sent(count=4):
     """What a robot sends in a few seconds; log times are 1 ms after the stamps."""
     sent: list[Sent] = []
     for step in range(count):

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import compose, inverse
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.rig import BoxRig, BubbleRig, CameraRig, ContactRig, HandRig, Rig
@@ -75,7 +72,7 @@ class SphereLog:
     finger: float | None = None
     cloud: tuple[tuple[float, float, float], ...] = ()
 
-    def write(self, path: Path) -> Path:
+    def write(self, path):
         """Five seconds: standing, a push onto the sphere, and one that passes it."""
         with LogWriter(path) as writer:
             for tick in range(101):
@@ -84,7 +81,7 @@ class SphereLog:
                 self._add(writer, "/probe", "std_msgs/String", {"data": text}, time_of(seconds))
         return path
 
-    def _send(self, writer: LogWriter, tick: int) -> None:
+    def _send(self, writer, tick):
         seconds = tick * 0.05
         stamp, hand = time_of(seconds), hand_pose(seconds)
         lost, found = self.lost_transforms
@@ -117,19 +114,17 @@ class SphereLog:
             for topic in ("/lidar", "/skin"):
                 self._add(writer, topic, "sensor_msgs/PointCloud2", cloud, stamp)
 
-    def _add(
-        self, writer: LogWriter, topic: str, kind: str, message: dict[str, Any], sent: int
-    ) -> None:
+    def _add(self, writer, topic, kind, message, sent):
         if topic not in self.left_out:
             writer.add(topic, kind, message, sent, sent + LATENCY)
 
 
-def time_of(seconds: float) -> int:
+def time_of(seconds):
     """Nanoseconds."""
     return BEGIN + round(seconds * SECOND)
 
 
-def hand_pose(seconds: float) -> FloatArray:
+def hand_pose(seconds):
     """Pose (4, 4) of the hand in the world: two pushes of two seconds, the second one aside."""
     push, within = divmod(seconds - 1.0, 2.0)
     travel = 1.0 - abs(within - 1.0) if push >= 0 else 0.0
@@ -138,24 +133,24 @@ def hand_pose(seconds: float) -> FloatArray:
     return compose(FORWARD, np.array([x, ASIDE * (push >= 1), CENTRE[2]]))
 
 
-def membrane(hand: FloatArray) -> FloatArray:
+def membrane(hand):
     """Depth (H, W) in the pad: the untouched plane, or the sphere where it is nearer."""
     return np.minimum(MEMBRANE, _to_sphere(INNER, hand @ HAND_FROM_PAD))
 
 
-def seen() -> FloatArray:
+def seen():
     """Depth (H, W) in the camera: the sphere, or the wall behind it."""
     ways = OUTER.directions() @ WORLD_FROM_CAMERA[:3, :3].T
     to_wall = (WALL - WORLD_FROM_CAMERA[0, 3]) / ways[..., 0]
     return np.minimum(to_wall, _to_sphere(OUTER, WORLD_FROM_CAMERA))
 
 
-def heights(points: FloatArray) -> FloatArray:
+def heights(points):
     """Signed distance (N,) of points (N, 3) to the sphere."""
     return np.sqrt(((points - CENTRE) ** 2).sum(axis=1)) - RADIUS
 
 
-def _to_sphere(camera: PinholeCamera, world_from_camera: FloatArray) -> FloatArray:
+def _to_sphere(camera, world_from_camera):
     """Depth (H, W) at which rays meet the sphere, infinite if they do not."""
     ways = camera.directions()
     centre = inverse(world_from_camera)[:3] @ [*CENTRE, 1.0]

@@ -1,9 +1,5 @@
-from __future__ import annotations
-
 import dataclasses
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,8 +14,6 @@ from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
 from runners.command.choices import CONF
 from runners.sensors.depth_frame import (
-    DepthFrame,
-    FramePoints,
     depth_frame_points,
     one_per_voxel,
     read_depth_frame,
@@ -33,14 +27,14 @@ FRONT, WALL = 0.5, 0.9  # m
 POSE = [[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
 
 
-def rig(**camera: Any) -> Rig:
+def rig(**camera):
     values = yaml.safe_load((CONF / "session" / "rig" / "depth_frame.yaml").read_text())
     built = build_settings(Rig, values, "session.rig")
     (only,) = built.cameras
     return dataclasses.replace(built, cameras=(dataclasses.replace(only, **camera),))
 
 
-def scene() -> tuple[np.ndarray, np.ndarray]:
+def scene():
     """Depths (H, W) in millimetres of a box before a wall, and the label image."""
     depth = np.full((HEIGHT, WIDTH), 1000 * WALL, dtype=np.uint16)
     depth[BOX] = 1000 * FRONT
@@ -50,7 +44,7 @@ def scene() -> tuple[np.ndarray, np.ndarray]:
     return depth, label
 
 
-def written(folder: Path, **changes: Any) -> Path:
+def written(folder, **changes):
     """A frame's YAML with its images beside it; None takes a key away."""
     depth, label = scene()
     Image.fromarray(depth).save(folder / "depth.png")
@@ -63,7 +57,7 @@ def written(folder: Path, **changes: Any) -> Path:
     return path
 
 
-def test_a_frame_is_read_with_all_its_parts(tmp_path: Path) -> None:
+def test_a_frame_is_read_with_all_its_parts(tmp_path):
     rounded = [[round(value, 6) for value in row] for row in POSE]
     path = written(
         tmp_path, world_from_camera=POSE, world_from_object=rounded, object="sub/box.obj"
@@ -108,9 +102,7 @@ def test_a_frame_is_read_with_all_its_parts(tmp_path: Path) -> None:
         ({"world_from_object": (2 * np.eye(4)).tolist()}, "world_from_object.* not a rigid"),
     ],
 )
-def test_broken_frames_are_refused_in_a_line(
-    tmp_path: Path, changes: dict[str, Any], message: str
-) -> None:
+def test_broken_frames_are_refused_in_a_line(tmp_path, changes, message):
     path = written(tmp_path, **changes)
     np.save(tmp_path / "other.npy", np.ones((2, 3), dtype=np.uint8))
     (tmp_path / "cut.png").write_bytes((tmp_path / "label.png").read_bytes()[:60])
@@ -121,11 +113,11 @@ def test_broken_frames_are_refused_in_a_line(
     assert "\n" not in str(caught.value)
 
 
-def points_of(frame: DepthFrame, own: Rig | None = None) -> FramePoints:
+def points_of(frame, own=None):
     return depth_frame_points(frame, own or rig(), free_resolution=0.01, diameter=0.3)
 
 
-def test_surface_points_are_the_boxes_front_without_its_outline(tmp_path: Path) -> None:
+def test_surface_points_are_the_boxes_front_without_its_outline(tmp_path):
     frame = read_depth_frame(written(tmp_path, world_from_camera=POSE))
     found = points_of(frame)
     expected = np.zeros((HEIGHT, WIDTH), dtype=bool)
@@ -160,9 +152,7 @@ def test_surface_points_are_the_boxes_front_without_its_outline(tmp_path: Path) 
         ((slice(20, 40), slice(30, 41)), WALL, False, "far"),  # further than the object is long
     ],
 )
-def test_pixels_of_a_label_that_are_not_connected_are_left_out(
-    tmp_path: Path, blob: tuple[slice, slice], depth: float, kept: bool, reason: str
-) -> None:
+def test_pixels_of_a_label_that_are_not_connected_are_left_out(tmp_path, blob, depth, kept, reason):
     frame = read_depth_frame(written(tmp_path))
     frame.depth[blob] = depth
     found = points_of(frame, rig(edge_reach=1))
@@ -178,7 +168,7 @@ def test_pixels_of_a_label_that_are_not_connected_are_left_out(
     assert found.points.known[:, 2].max() == pytest.approx(depth if kept else FRONT)
 
 
-def test_few_pixels_of_another_depth_give_no_rays(tmp_path: Path) -> None:
+def test_few_pixels_of_another_depth_give_no_rays(tmp_path):
     frame = read_depth_frame(written(tmp_path, label=None, object_class=None))
     bounds = ((-0.3, 0.3), (-0.3, 0.3), (0.3, 1.5))
     own = dataclasses.replace(rig(), workspace=bounds)
@@ -190,12 +180,12 @@ def test_few_pixels_of_another_depth_give_no_rays(tmp_path: Path) -> None:
     assert depth_frame_points(frame, every, free_resolution=0.02).points.free[:, 2].max() > 1.3
 
 
-def frame_points(frame: DepthFrame, found: FramePoints) -> np.ndarray:
+def frame_points(frame, found):
     """World points of all surface pixels."""
     return apply(frame.world_from_camera, frame.camera.back_project(frame.depth)[found.surface])
 
 
-def test_free_space_is_what_rays_passed(tmp_path: Path) -> None:
+def test_free_space_is_what_rays_passed(tmp_path):
     frame = read_depth_frame(written(tmp_path))
     found = points_of(frame)
     free = found.points.free
@@ -216,13 +206,13 @@ def test_free_space_is_what_rays_passed(tmp_path: Path) -> None:
     assert distances.min() > np.sqrt(0.75) * 0.01
 
 
-def test_one_point_a_voxel_is_kept_the_one_nearest_its_centre() -> None:
+def test_one_point_a_voxel_is_kept_the_one_nearest_its_centre():
     points = np.array([[0.004, 0, 0], [0.011, 0, 0], [0.001, 0.001, 0], [0.01, 0, 0]])
     np.testing.assert_array_equal(one_per_voxel(points, 0.01), points[[2, 3]])
     assert one_per_voxel(np.zeros((0, 3)), 0.01).shape == (0, 3)
 
 
-def test_frames_and_rigs_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+def test_frames_and_rigs_that_do_not_fit_are_refused(tmp_path):
     frame = read_depth_frame(written(tmp_path))
     without = dataclasses.replace(frame, label=None)
     with pytest.raises(SettingError, match=r"workspace is missing.*accepted: \[\[x0"):
@@ -239,7 +229,7 @@ def test_frames_and_rigs_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         points_of(dataclasses.replace(frame, label=dots))
 
 
-def real_frame(folder: Path, name: str) -> tuple[DepthFrame, FramePoints, Any, np.ndarray]:
+def real_frame(folder, name):
     """A frame, its points, its mesh, and the signed distances of surface points at its pose."""
     path = folder / "ycbv_000001" / name
     if not path.is_file():
@@ -252,7 +242,7 @@ def real_frame(folder: Path, name: str) -> tuple[DepthFrame, FramePoints, Any, n
     return frame, found, mesh, mesh_sdf(mesh, apply(truth, found.points.known))[0]
 
 
-def test_the_real_frame_registers_near_its_published_pose(real_directory: Path) -> None:
+def test_the_real_frame_registers_near_its_published_pose(real_directory):
     frame, found, mesh, distance = real_frame(real_directory, "frame.yaml")
     points = found.points
     truth = inverse(frame.world_from_object)
@@ -271,9 +261,7 @@ def test_the_real_frame_registers_near_its_published_pose(real_directory: Path) 
     assert np.linalg.norm(miss) < 0.015
 
 
-def test_the_real_frame_of_a_brick_has_no_point_off_it_and_no_free_voxel_in_it(
-    real_directory: Path,
-) -> None:
+def test_the_real_frame_of_a_brick_has_no_point_off_it_and_no_free_voxel_in_it(real_directory):
     frame, found, mesh, distance = real_frame(real_directory, "frame_foam_brick.yaml")
     assert found.labelled is not None
     assert found.labelled.small == 50  # a patch 26 mm behind the brick, at its upper edge

@@ -1,20 +1,14 @@
 """Rigs with a hand alone, and contacts that a force sensor in the wrist feels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
 from chsel.errors import SessionError, SettingError
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse, roll_pitch_yaw
 from chsel.problem.settings import build_settings
-from replay.events import Probe
 from runners.command.choices import CONF
 from runners.sensors.rig import Annotations, BoxRig, ForceRig, HandRig, Rig
 from runners.sensors.session_report import Counts
@@ -39,14 +33,14 @@ TIP = np.array([0.012, -0.017, 0.1])  # m: where the hand is touched, in its fra
 FORCE = np.array([1.0, -0.5, -6.0])  # N on the hand, with friction, in its frame
 
 
-def hand_pose(seconds: float) -> FloatArray:
+def hand_pose(seconds):
     """The hand goes along the world's x axis, which is its z axis, for a second, and back."""
     travel = max(0.0, 1.0 - abs(seconds - 2.0))
     forward = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     return compose(forward, np.array([0.3 + 0.1 * travel, 0.0, 0.1]))
 
 
-def wrench(seconds: float) -> FloatArray:
+def wrench(seconds):
     """Force and torque (6,) of a contact in the sensor's frame; it lasts for 0.1 s."""
     if abs(seconds - 2.0) >= 0.055 and abs(seconds - 1.5) > 1e-6:  # a spike
         return np.zeros(6)
@@ -55,7 +49,7 @@ def wrench(seconds: float) -> FloatArray:
     return np.concatenate([force, np.cross(apply(sensor_from_hand, TIP[None])[0], force)])
 
 
-def write_log(path: Path, *, torque: bool = True, settled: float = 0.0, lacks: str = "") -> Path:
+def write_log(path, *, torque=True, settled=0.0, lacks=""):
     """Four seconds at 100 Hz; lacks: a topic without messages.
 
     settled: seconds before which the sensor measures twice the hand's weight.
@@ -78,23 +72,23 @@ def write_log(path: Path, *, torque: bool = True, settled: float = 0.0, lacks: s
     return path
 
 
-def read(path: Path, **changes: Any) -> tuple[Counts, Probe, str]:
+def read(path, **changes):
     """What the forces gave, and what is known then; changes: of the rig."""
     session, (probe,), told = small_logs.read(path, replace(RIG, **changes))
     return session.report.total().get("/wrench", Counts()), probe, told
 
 
-def in_hand(probe: Probe) -> FloatArray:
+def in_hand(probe):
     """Contacts (C, 3) in the hand's frame at its furthest."""
     return apply(inverse(hand_pose(2.0)), probe.contacts)
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(tmp_path_factory):
     return write_log(tmp_path_factory.mktemp("log") / "log.mcap")
 
 
-def test_a_contact_is_where_the_line_of_force_enters_the_hand(log: Path) -> None:
+def test_a_contact_is_where_the_line_of_force_enters_the_hand(log):
     counts, probe, told = read(log)
     assert len(probe.contacts) == counts.contacts == 2  # 10 mm of way are two voxels of 5 mm
     np.testing.assert_allclose(in_hand(probe)[:, :2], np.tile(TIP[:2], (2, 1)), atol=1e-5)
@@ -112,9 +106,7 @@ def test_a_contact_is_where_the_line_of_force_enters_the_hand(log: Path) -> None
     assert (free[near, 0] <= probe.contacts[:, 0].max() + 1e-9).all()
 
 
-def test_without_torques_the_foremost_part_of_the_hand_is_touched(
-    log: Path, tmp_path: Path
-) -> None:
+def test_without_torques_the_foremost_part_of_the_hand_is_touched(log, tmp_path):
     square = replace(HAND, boxes=(replace(HAND.boxes[0], rotation=(0.0, 0.0, 0.4)),))
     path = write_log(tmp_path / "log.mcap", torque=False)
     corner = roll_pitch_yaw(np.array([0.0, 0.0, 0.4]))[:2, :2] @ [-0.02, 0.03]
@@ -135,13 +127,13 @@ def test_without_torques_the_foremost_part_of_the_hand_is_touched(
         ({"acts": "by_hand", "points": 1}, 1),  # the line then enters where it left
     ],
 )
-def test_settings_of_forces(log: Path, changes: dict[str, Any], contacts: int) -> None:
+def test_settings_of_forces(log, changes, contacts):
     counts, probe, _ = read(log, forces=(replace(FORCES, **changes),))
     assert (len(probe.contacts), counts.outside) == (contacts, 0)
     assert (in_hand(probe)[:, 2] < 0.06).all() == (contacts == 0 or "acts" in changes)
 
 
-def test_a_line_of_force_that_misses_the_hand_is_left_out(log: Path) -> None:
+def test_a_line_of_force_that_misses_the_hand_is_left_out(log):
     thin = replace(HAND, boxes=(BoxRig((0.01, 0.01, 0.1), (0.0, 0.0, 0.05)),))
     for reach, outside in ((0.004, 11), (0.05, 0)):
         counts, probe, told = read(log, hand=thin, forces=(replace(FORCES, reach=reach),))
@@ -149,9 +141,7 @@ def test_a_line_of_force_that_misses_the_hand_is_left_out(log: Path) -> None:
         assert ("11 out of reach" in told) == (len(probe.contacts) == 0) == (outside == 11)
 
 
-def test_the_tare_is_of_the_last_seconds_before_a_probe_or_of_the_first(
-    log: Path, tmp_path: Path
-) -> None:
+def test_the_tare_is_of_the_last_seconds_before_a_probe_or_of_the_first(log, tmp_path):
     unmarked = write_log(tmp_path / "unmarked.mcap", lacks="/probe")
     _, probe, told = read(unmarked, markers=None)
     assert len(probe.contacts) == 2
@@ -163,7 +153,7 @@ def test_the_tare_is_of_the_last_seconds_before_a_probe_or_of_the_first(
     np.testing.assert_array_equal(found, expected)
 
 
-def test_a_hand_alone_gives_free_space(log: Path, tmp_path: Path) -> None:
+def test_a_hand_alone_gives_free_space(log, tmp_path):
     without = write_log(tmp_path / "log.mcap", lacks="/wrench")
     _, probe, _ = read(without, forces=())
     assert (probe.outcome, len(probe.contacts)) == ("free", 0)
@@ -175,7 +165,7 @@ def test_a_hand_alone_gives_free_space(log: Path, tmp_path: Path) -> None:
         replace(RIG, hand=HandRig("hand"))
 
 
-def test_the_rig_to_start_from_is_read() -> None:
+def test_the_rig_to_start_from_is_read():
     values = yaml.safe_load((CONF / "session" / "rig" / "wrist_force.yaml").read_text())
     rig = build_settings(Rig, values, "session.rig")
     assert rig.forces == (ForceRig("/wrist/wrench"),)

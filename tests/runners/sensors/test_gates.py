@@ -1,17 +1,13 @@
 """What sensors measured of something else, or wrongly, does not become points of the object."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
 
-from chsel.numerics.arrays import FloatArray
 from replay.events import Logged
 from replay.mcap.reader import read_recording
 from runners.probe import main
@@ -28,12 +24,10 @@ WITHOUT = GateRig(jump=1e6, part=0.0, speckle=0)
 
 
 @pytest.mark.parametrize("kind", ["depth", "deformation"])
-def test_pixels_of_a_pad_that_jump_are_no_contact(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
+def test_pixels_of_a_pad_that_jump_are_no_contact(tmp_path, monkeypatch, kind):
     """Of deformations, neither are those beside, to which the mean filter would spread them."""
 
-    def spoilt(hand: FloatArray) -> FloatArray:
+    def spoilt(hand):
         depth = PLAIN_MEMBRANE(hand)
         if hand[0, 3] > 0.7 or kind == "deformation":
             depth[2:7, 40:45] = 0.02  # a reflection, 40 mm before the membrane at all times
@@ -58,10 +52,8 @@ def test_pixels_of_a_pad_that_jump_are_no_contact(
     assert np.abs(heights(touching.contacts)).max() > 0.02
 
 
-def test_small_patches_of_contact_beside_a_large_one_are_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def wrinkled(hand: FloatArray) -> FloatArray:
+def test_small_patches_of_contact_beside_a_large_one_are_left_out(tmp_path, monkeypatch):
+    def wrinkled(hand):
         rows, columns = np.mgrid[:36, :48]
         hill = 0.015 * np.exp(-((rows - 4) ** 2 + (columns - 4) ** 2) / 12.0)
         return PLAIN_MEMBRANE(hand) - hill * (hand[0, 3] > 0.7)
@@ -76,11 +68,11 @@ def test_small_patches_of_contact_beside_a_large_one_are_left_out(
     assert np.abs(heights(read(log, every)[1][0].contacts)).max() > 0.006
 
 
-def cloud_rig(role: str) -> Rig:
+def cloud_rig(role):
     return Rig("lidar", "world", RIG.workspace, clouds=(CloudRig("/cloud", role),))
 
 
-def cloud_log(path: Path, points: FloatArray) -> Path:
+def cloud_log(path, points):
     """A log of one message of points (N, 3) in the world."""
     fixed = {"transforms": [transform("world", "lidar", np.eye(4), BEGIN)]}
     cloud = ros2_cloud(points.astype(np.float32), BEGIN + 1)
@@ -89,13 +81,13 @@ def cloud_log(path: Path, points: FloatArray) -> Path:
     return path
 
 
-def on_sphere(count: int, centre: FloatArray) -> FloatArray:
+def on_sphere(count, centre):
     ways = np.random.default_rng(count).normal(size=(count, 3))
     return centre + RADIUS * ways / np.sqrt((ways**2).sum(axis=1, keepdims=True))
 
 
 @pytest.mark.parametrize("role", ["surface", "contacts"])
-def test_points_of_a_cloud_that_are_not_connected_are_left_out(tmp_path: Path, role: str) -> None:
+def test_points_of_a_cloud_that_are_not_connected_are_left_out(tmp_path, role):
     crumbs = CENTRE + [0.0, 0.1, 0.0] + 0.004 * np.eye(3)
     other = on_sphere(600, CENTRE - [0.0, 0.15, 0.0])
     points = np.concatenate([on_sphere(2000, CENTRE), crumbs, other])
@@ -114,7 +106,7 @@ def test_points_of_a_cloud_that_are_not_connected_are_left_out(tmp_path: Path, r
     assert len(read(few, rig, 2 * RADIUS)[1][0].new_points.known) == 4
 
 
-def test_ends_of_rays_that_are_too_far_away_give_no_free_space(tmp_path: Path) -> None:
+def test_ends_of_rays_that_are_too_far_away_give_no_free_space(tmp_path):
     ends = np.array([[1.0, 0.2, 0.55], [200.0, 0.0, 100.0]])  # m
     session, (probe,), _ = read(cloud_log(tmp_path / "log.mcap", ends), cloud_rig("rays"))
     assert session.report.total()["/cloud"].outside == 1
@@ -123,7 +115,7 @@ def test_ends_of_rays_that_are_too_far_away_give_no_free_space(tmp_path: Path) -
     np.testing.assert_array_equal(probe.new_points.free, near.new_points.free)
 
 
-def test_counts_stand_in_the_table_the_recording_and_the_summary(tmp_path: Path) -> None:
+def test_counts_stand_in_the_table_the_recording_and_the_summary(tmp_path):
     path = written(tmp_path)
     depth = scene()[0]
     depth[22:38, 30:45] = 520 + 40 * (np.indices((16, 15)).sum(axis=0) % 2)  # of no surface

@@ -1,7 +1,4 @@
-from __future__ import annotations
-
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,22 +43,22 @@ GRIPPER = """<?xml version="1.0"?>
 """
 
 
-def urdf(folder: Path, text: str = GRIPPER) -> str:
+def urdf(folder, text=GRIPPER):
     path = folder / "gripper.urdf"
     path.write_text(text)
     return str(path)
 
 
-def one_link(folder: Path, geometry: str) -> str:
+def one_link(folder, geometry):
     shape = f"<collision><geometry>{geometry}</geometry></collision>"
     return urdf(folder, f'<robot name="r"><link name="a">{shape}</link></robot>')
 
 
-def hand(path: str, root: str | None = None) -> HandRig:
+def hand(path, root=None):
     return HandRig(frame="hand", urdf=path, root=root)
 
 
-def test_boxes_stand_where_the_rig_puts_them() -> None:
+def test_boxes_stand_where_the_rig_puts_them():
     turned = (np.pi / 2, 0.0, np.pi / 2)
     boxes = BoxRig((0.1, 0.2, 0.3), (1.0, 0.0, 0.0)), BoxRig((0.1, 0.2, 0.3), rotation=turned)
     solids = HandModel(HandRig(frame="hand", boxes=boxes)).solids()
@@ -75,7 +72,7 @@ def test_boxes_stand_where_the_rig_puts_them() -> None:
 
 
 @pytest.mark.parametrize("arm", ["revolute", "planar"])
-def test_joints_place_the_links(tmp_path: Path, arm: str) -> None:
+def test_joints_place_the_links(tmp_path, arm):
     """arm: what its joint is, whose values do not matter to the hand."""
     joints = {"slide": 0.02, "bend": 0.4, "elbow": 7.0, "wrist": 9.0}
     model = HandModel(hand(urdf(tmp_path, GRIPPER.replace("revolute", arm)), "palm"))
@@ -94,14 +91,14 @@ def test_joints_place_the_links(tmp_path: Path, arm: str) -> None:
     np.testing.assert_allclose(tip.bounds.mean(axis=0), [-0.03, 0.0, 0.0], atol=1e-9)
 
 
-def test_the_base_is_the_root_unless_another_is_named(tmp_path: Path) -> None:
+def test_the_base_is_the_root_unless_another_is_named(tmp_path):
     whole = HandModel(hand(urdf(tmp_path)))
     assert len(whole.parts()) == 5
     assert whole.joint_names == ("wrist", "slide", "bend")
     np.testing.assert_allclose(whole.parts()[1].bounds[:, 2], [1.0, 1.1])
 
 
-def test_meshes_are_found_beside_the_urdf_and_in_its_packages(tmp_path: Path) -> None:
+def test_meshes_are_found_beside_the_urdf_and_in_its_packages(tmp_path):
     package = tmp_path / "gripper_description"
     (package / "meshes").mkdir(parents=True)
     (package / "urdf").mkdir()
@@ -124,9 +121,7 @@ def test_meshes_are_found_beside_the_urdf_and_in_its_packages(tmp_path: Path) ->
     assert "a mesh of link a is open; its convex hull is used" in "".join(model.warnings)
 
 
-def test_without_yourdfpy_boxes_work_and_a_urdf_names_the_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_yourdfpy_boxes_work_and_a_urdf_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "yourdfpy", None)
     assert HandModel(HandRig(frame="hand", boxes=(BoxRig((0.1, 0.1, 0.1)),))).solids() is not None
     with pytest.raises(SettingError, match=r"pip install -e '\.\[sensors\]'"):
@@ -143,7 +138,7 @@ def test_without_yourdfpy_boxes_work_and_a_urdf_names_the_extra(
         (GRIPPER.replace('mimic joint="slide"', 'mimic joint="follow"'), "follow mimics follow"),
     ],
 )
-def test_unusable_files_are_refused_in_a_line(tmp_path: Path, text: str, message: str) -> None:
+def test_unusable_files_are_refused_in_a_line(tmp_path, text, message):
     with pytest.raises(SettingError, match=message) as caught:
         HandModel(hand(urdf(tmp_path, text)))
     assert f"hand.urdf {tmp_path}" in str(caught.value)

@@ -1,9 +1,5 @@
 """Files that say where an object is."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import yaml
@@ -16,7 +12,7 @@ POSE = compose(rotation_vector(np.array([0.3, -1.2, 0.4])), np.array([0.9, -0.05
 ROWS = "world_from_object: [[1,0,0,0.5],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
 
 
-def test_a_pose_is_read_as_it_was_written_and_replaced_if_that_is_wanted(tmp_path: Path) -> None:
+def test_a_pose_is_read_as_it_was_written_and_replaced_if_that_is_wanted(tmp_path):
     path = beside(tmp_path / "a.b.mcap")
     assert path == beside(tmp_path / "a.b") == tmp_path / "a.b.pose.yaml"
     write_pose(path, POSE, {"cost": 0.25, "search": {"spans": (1, 2)}})
@@ -29,7 +25,7 @@ def test_a_pose_is_read_as_it_was_written_and_replaced_if_that_is_wanted(tmp_pat
     np.testing.assert_array_equal(read_pose(path), np.eye(4))
 
 
-def test_a_rotation_written_by_hand_is_made_exact(tmp_path: Path) -> None:
+def test_a_rotation_written_by_hand_is_made_exact(tmp_path):
     path = tmp_path / "hand.yaml"
     rows = [[0.866, -0.5, 0, 0.9], [0.5, 0.866, 0, 0], [0, 0, 1, 0.31], [0, 0, 0, 1]]
     path.write_text(f"world_from_object: {rows}")
@@ -50,7 +46,7 @@ def test_a_rotation_written_by_hand_is_made_exact(tmp_path: Path) -> None:
         (None, r"pose file .* cannot be read"),
     ],
 )
-def test_another_file_is_one_line(tmp_path: Path, text: str | None, message: str) -> None:
+def test_another_file_is_one_line(tmp_path, text, message):
     path = tmp_path / "pose.yaml"
     if text is not None:
         path.write_text(text)

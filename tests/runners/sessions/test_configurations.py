@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -30,7 +28,7 @@ PROBES = {"drill": 30, "drill_opposite": 25, "drill_slanted": 25, "drill_fallen"
 PROBES |= {"mustard": 16, "hammer": 16, "mustard_fallen_sideways": 15}  # all others: 12
 
 
-def test_every_object_has_its_configurations_and_these_their_numbers_of_probes() -> None:
+def test_every_object_has_its_configurations_and_these_their_numbers_of_probes():
     assert len(CONFIGURATIONS) == 17
     assert {one.object for one in CONFIGURATIONS.values()} == set(MODELS)
     for name, found in CONFIGURATIONS.items():
@@ -39,14 +37,14 @@ def test_every_object_has_its_configurations_and_these_their_numbers_of_probes()
         assert found.grid[: len(found.z) + 1] == [*first, (found.y[1], found.z[0])]
 
 
-def test_the_placements_that_differ_from_the_experiments_are_named_in_the_readme() -> None:
+def test_the_placements_that_differ_from_the_experiments_are_named_in_the_readme():
     readme = (Path(__file__).resolve().parents[3] / "README.md").read_text()
     passage = readme.partition("**Simulated sessions.**")[2].partition("**Scans.**")[0]
     assert set(re.findall(r"`([a-z_]+)`", passage)) & set(CONFIGURATIONS) == set(THEIRS)
     assert all(CONFIGURATIONS[name].position != there for name, there in THEIRS.items())
 
 
-def test_a_configuration_that_is_not_accepted_is_an_error_that_lists_those_that_are() -> None:
+def test_a_configuration_that_is_not_accepted_is_an_error_that_lists_those_that_are():
     with pytest.raises(SettingError) as error:
         find_configuration("dril")
     assert all(name in str(error.value) for name in CONFIGURATIONS)
@@ -55,16 +53,14 @@ def test_a_configuration_that_is_not_accepted_is_an_error_that_lists_those_that_
     assert find_configuration("clamp", "mesh").object == "clamp"
 
 
-def test_the_hammer_has_a_larger_workspace_but_in_the_paper() -> None:
+def test_the_hammer_has_a_larger_workspace_but_in_the_paper():
     hammer, settings = find_configuration("hammer"), ProbingSettings()
     assert choose_workspace(hammer, in_preset(settings, "reference")).upper == (0.5, 0.5, 0.4)
     assert choose_workspace(hammer, in_preset(settings, "paper")).upper == (0.5, 0.3, 0.625)
 
 
 @pytest.mark.parametrize(("tilt", "turned", "height"), [(0.3, 0.0, 0.15), (0.8, np.pi / 2, 0.1)])
-def test_a_tilted_box_rolls_onto_the_face_that_balances(
-    tilt: float, turned: float, height: float
-) -> None:
+def test_a_tilted_box_rolls_onto_the_face_that_balances(tilt, turned, height):
     box = trimesh.creation.box((0.1, 0.2, 0.3))
     tilted = compose(axis_angle(np.array([1.0, 0.0, 0.0]), tilt), np.array([0.0, 0.0, 1.0]))
     resting = roll_to_rest(box, tilted)
@@ -76,7 +72,7 @@ def test_a_tilted_box_rolls_onto_the_face_that_balances(
 
 
 @pytest.mark.parametrize("name", ["drill_fallen", "mustard_fallen", "hammer_straight", "clamp"])
-def test_objects_rest_on_the_floor_above_what_they_stand_on(name: str) -> None:
+def test_objects_rest_on_the_floor_above_what_they_stand_on(name):
     configuration = CONFIGURATIONS[name]
     mesh = load_model(configuration.object).apply_scale(2.5)
     resting = laid_down(mesh, configuration)

@@ -1,9 +1,5 @@
-from __future__ import annotations
-
 import re
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,13 +29,13 @@ STICK = """<robot name="stick">
 
 
 @pytest.fixture
-def stick(tmp_path: Path) -> DescribedHand:
+def stick(tmp_path):
     path = tmp_path / "stick.urdf"
     path.write_text(STICK)
     return DescribedHand(urdf=str(path), root="stick")
 
 
-def test_a_hand_from_a_urdf_probes_along_its_z_axis(stick: DescribedHand) -> None:
+def test_a_hand_from_a_urdf_probes_along_its_z_axis(stick):
     hand = open_hand(stick)
     np.testing.assert_allclose(
         hand.shape.bounds, [[-0.02, -0.03, -0.04], [0.06, 0.03, 0.12]], atol=1e-12
@@ -55,7 +51,7 @@ def test_a_hand_from_a_urdf_probes_along_its_z_axis(stick: DescribedHand) -> Non
 
 
 @pytest.mark.parametrize("kind", ["kinematic", "simulated"])
-def test_both_engines_touch_with_the_described_hand(kind: str, stick: DescribedHand) -> None:
+def test_both_engines_touch_with_the_described_hand(kind, stick):
     box = trimesh.creation.box((0.2, 0.3, 0.3))
     settings = replace(ProbingSettings(), hand=stick, noise=0.0)
     if kind == "simulated":
@@ -79,7 +75,7 @@ def test_both_engines_touch_with_the_described_hand(kind: str, stick: DescribedH
     session.close()
 
 
-def opened(hand: dict[str, Any]) -> None:
+def opened(hand):
     settings = build_settings(ProbingSettings, {"hand": hand}, "session")
     open_probing("kinematic", trimesh.creation.box((0.2, 0.3, 0.3)), "can", settings, 0)
 
@@ -95,9 +91,7 @@ def opened(hand: dict[str, Any]) -> None:
         ({"boxes": [{"size": [0.1, -0.1, 0.1]}]}, "size is -0.1"),
     ],
 )
-def test_a_hand_that_cannot_be_is_an_error(
-    hand: dict[str, Any], message: str, stick: DescribedHand
-) -> None:
+def test_a_hand_that_cannot_be_is_an_error(hand, message, stick):
     if hand.get("urdf") == "STICK":
         hand = {**hand, "urdf": stick.urdf}
 

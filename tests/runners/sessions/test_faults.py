@@ -1,7 +1,5 @@
 """Faults on a ball: what is reported against what was met."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 
@@ -10,10 +8,8 @@ import pytest
 import trimesh
 
 from chsel.errors import SettingError
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import FreeVoxels, Lattice, Workspace
 from chsel.problem.settings import settings_mapping
-from replay.events import Probe
 from runners.objects.loader import load_model
 from runners.sessions.faults import (
     CLEAN,
@@ -23,7 +19,7 @@ from runners.sessions.faults import (
     level_name,
     probed_mesh,
 )
-from runners.sessions.probing import ProbingSession, open_probing
+from runners.sessions.probing import open_probing
 from runners.sessions.probing_settings import ProbingSettings, without_defaults
 
 RADIUS, SIDE = 0.1, 0.02
@@ -31,12 +27,12 @@ CENTRE = np.array([0.3, 0.0, 0.2])
 WORKSPACE = Workspace((0.0, -0.3, 0.0), (0.6, 0.3, 0.5))
 
 
-def directions(count: int) -> FloatArray:
+def directions(count):
     drawn = np.random.default_rng(0).normal(size=(count, 3))
     return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
 
 
-def of_ball(free: FreeVoxels | None = None, seed: int = 0, **settings: float) -> Faults:
+def of_ball(free=None, seed=0, **settings):
     pose = np.eye(4)
     pose[:3, 3] = CENTRE
     return Faults(
@@ -49,7 +45,7 @@ def of_ball(free: FreeVoxels | None = None, seed: int = 0, **settings: float) ->
     )
 
 
-def reported(count: int, faults: Faults, steps: int = 1) -> tuple[FloatArray, FloatArray]:
+def reported(count, faults, steps=1):
     """True contacts all over the ball, (C, 3), and those reported of them, (C', 3)."""
     normals = directions(count)
     contacts = CENTRE + RADIUS * normals
@@ -61,20 +57,20 @@ def reported(count: int, faults: Faults, steps: int = 1) -> tuple[FloatArray, Fl
     return contacts, np.concatenate([places for places, _ in found])
 
 
-def test_noise_has_its_deviation_along_each_axis_and_along_normals() -> None:
+def test_noise_has_its_deviation_along_each_axis_and_along_normals():
     contacts, found = reported(4000, of_ball(contact_noise=0.003))
     off = found - contacts
     np.testing.assert_allclose(off.std(axis=0), 0.003, rtol=0.05)
     assert (off * directions(4000)).sum(axis=1).std() == pytest.approx(0.003, rel=0.05)
 
 
-def test_rounded_contacts_are_on_the_lattice() -> None:
+def test_rounded_contacts_are_on_the_lattice():
     contacts, found = reported(50, of_ball(quantisation=0.005))
     np.testing.assert_allclose(np.rint(found / 0.005) * 0.005, found, atol=1e-15)
     assert 0.0015 < np.abs(found - contacts).max() <= 0.0025 + 1e-12
 
 
-def test_a_bias_is_the_same_shift_in_all_steps() -> None:
+def test_a_bias_is_the_same_shift_in_all_steps():
     contacts, found = reported(20, of_ball(camera_bias=0.005), steps=4)
     off = found - contacts
     np.testing.assert_allclose(off, np.broadcast_to(off[0], off.shape), atol=1e-12)
@@ -82,7 +78,7 @@ def test_a_bias_is_the_same_shift_in_all_steps() -> None:
 
 
 @pytest.mark.parametrize("share", [0.1, 0.2])
-def test_so_many_contacts_are_foreign_and_off_the_object(share: float) -> None:
+def test_so_many_contacts_are_foreign_and_off_the_object(share):
     _, found = reported(180, of_ball(foreign_contacts=share), steps=60)
     off = np.linalg.norm(found - CENTRE, axis=1) - RADIUS
     foreign = off > 1e-3
@@ -92,7 +88,7 @@ def test_so_many_contacts_are_foreign_and_off_the_object(share: float) -> None:
     assert (found[foreign] >= WORKSPACE.lower).all()
 
 
-def test_foreign_contacts_are_not_in_voxels_told_free() -> None:
+def test_foreign_contacts_are_not_in_voxels_told_free():
     free = FreeVoxels(Lattice((0.0, 0.0, 0.0), SIDE))
     axes = np.arange(0, 30) * SIDE
     everywhere = np.stack(np.meshgrid(axes, axes - 0.3, axes), axis=-1).reshape(-1, 3)
@@ -107,7 +103,7 @@ def test_foreign_contacts_are_not_in_voxels_told_free() -> None:
 
 
 @pytest.mark.parametrize("reach", [0.5, 1.0])
-def test_wrongly_free_voxels_are_inside_within_reach_and_told_once(reach: float) -> None:
+def test_wrongly_free_voxels_are_inside_within_reach_and_told_once(reach):
     free = FreeVoxels(Lattice((0.0, 0.0, 0.0), SIDE))
     axes = np.arange(-8, 9) * SIDE
     around = CENTRE + np.stack(np.meshgrid(axes, axes, axes), axis=-1).reshape(-1, 3)
@@ -123,7 +119,7 @@ def test_wrongly_free_voxels_are_inside_within_reach_and_told_once(reach: float)
     assert len(some.wrongly_free(1, swept)) == 0  # each had its chance
 
 
-def test_no_fault_reports_what_was_met_and_each_depends_on_seed_and_step() -> None:
+def test_no_fault_reports_what_was_met_and_each_depends_on_seed_and_step():
     contacts, found = reported(20, of_ball())
     np.testing.assert_array_equal(contacts, found)
     assert len(of_ball().wrongly_free(0, contacts)) == 0
@@ -134,7 +130,7 @@ def test_no_fault_reports_what_was_met_and_each_depends_on_seed_and_step() -> No
     assert not (first[4:] == late[4:]).any()
 
 
-def test_the_probed_mesh_is_smaller_about_the_same_centre() -> None:
+def test_the_probed_mesh_is_smaller_about_the_same_centre():
     mesh = trimesh.creation.box((0.1, 0.2, 0.3)).apply_translation([1.0, 2.0, 3.0])
     probed = probed_mesh(mesh, FaultSettings(mesh_scale=1.02))
     np.testing.assert_allclose(probed.extents, mesh.extents / 1.02)
@@ -142,13 +138,13 @@ def test_the_probed_mesh_is_smaller_about_the_same_centre() -> None:
     assert probed_mesh(mesh, FaultSettings()) is mesh
 
 
-def kinematic(**faults: float) -> tuple[ProbingSession, list[Probe]]:
+def kinematic(**faults):
     settings = ProbingSettings(faults=FaultSettings(**faults))
     session = open_probing("kinematic", load_model("cracker_box", 1.5), "box", settings, 0)
     return session, list(session.probes())
 
 
-def test_a_session_with_faults_is_the_same_session() -> None:
+def test_a_session_with_faults_is_the_same_session():
     clean, before = kinematic()
     faulty, after = kinematic(contact_noise=0.003, foreign_contacts=0.2, free_error=0.2)
     np.testing.assert_array_equal(clean.world_from_object, faulty.world_from_object)
@@ -166,7 +162,7 @@ def test_a_session_with_faults_is_the_same_session() -> None:
     assert after[0].contacts[0, 0] > before[0].contacts[0, 0] + 0.002
 
 
-def test_levels_have_names_and_are_recorded_unless_clean() -> None:
+def test_levels_have_names_and_are_recorded_unless_clean():
     assert [level_name(level) for level in LEVELS.values()] == list(LEVELS)
     assert level_name(replace(LEVELS["mixed"], contact_noise=0.004)) == "own"
     session = {"kind": "kinematic", "faults": settings_mapping(LEVELS[CLEAN])}
@@ -177,7 +173,7 @@ def test_levels_have_names_and_are_recorded_unless_clean() -> None:
     assert without_defaults(session) == session
 
 
-def test_faults_that_cannot_be_are_errors() -> None:
+def test_faults_that_cannot_be_are_errors():
     for name, value, accepted in (
         ("contact_noise", -0.001, "0 to 0.1 (m)"),
         ("foreign_contacts", 0.6, "0 to 0.5"),

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +21,7 @@ DEFAULT = ProbingSettings()
 TIP = 0.1123  # m: from the hand's origin to the end of its fingers
 
 
-def _run(name: str, settings: ProbingSettings = DEFAULT, seed: int = 0) -> Run:
+def _run(name, settings=DEFAULT, seed=0):
     scales = {"cracker_box": 1.5, "clamp": 5.0}
     of = CONFIGURATIONS[name].object
     mesh = load_model(of).apply_scale(scales.get(of, 2.5))
@@ -32,11 +30,11 @@ def _run(name: str, settings: ProbingSettings = DEFAULT, seed: int = 0) -> Run:
 
 
 @pytest.fixture(scope="module")
-def drill() -> Run:
+def drill():
     return _run("drill_slanted")
 
 
-def test_the_hand_has_the_outer_size_of_a_franka_hand() -> None:
+def test_the_hand_has_the_outer_size_of_a_franka_hand():
     solids = panda_hand().solids
     bounds = np.array([solid.bounds for solid in solids])
     lower, upper = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
@@ -49,7 +47,7 @@ def test_the_hand_has_the_outer_size_of_a_franka_hand() -> None:
     assert len(points) > 1000
 
 
-def test_a_wall_stops_the_finger_tip_to_a_micrometre_and_lets_it_go() -> None:
+def test_a_wall_stops_the_finger_tip_to_a_micrometre_and_lets_it_go():
     wall = trimesh.creation.box((0.1, 2.0, 2.0))
     pose = np.eye(4)
     pose[0, 3] = 0.15
@@ -65,7 +63,7 @@ def test_a_wall_stops_the_finger_tip_to_a_micrometre_and_lets_it_go() -> None:
     assert back.position[0] == pytest.approx(touch.position[0] - 0.002)
 
 
-def test_contacts_lie_on_the_surface_with_normals_out_of_it(drill: Run) -> None:
+def test_contacts_lie_on_the_surface_with_normals_out_of_it(drill):
     mesh, session, probes = drill
     assert session.world_from_object is not None
     contacts = np.concatenate([probe.contacts for probe in probes])
@@ -77,7 +75,7 @@ def test_contacts_lie_on_the_surface_with_normals_out_of_it(drill: Run) -> None:
     assert outside.min() > 0.5e-4
 
 
-def test_the_hand_is_never_in_the_object(drill: Run) -> None:
+def test_the_hand_is_never_in_the_object(drill):
     mesh, session, probes = drill
     assert session.world_from_object is not None
     surface = panda_hand().surface_points(0.004)
@@ -88,7 +86,7 @@ def test_the_hand_is_never_in_the_object(drill: Run) -> None:
         assert mesh_sdf(mesh, points)[0].min() > -1e-5
 
 
-def test_free_voxels_are_new_each_time_and_not_deep_in_the_object(drill: Run) -> None:
+def test_free_voxels_are_new_each_time_and_not_deep_in_the_object(drill):
     mesh, session, probes = drill
     assert session.world_from_object is not None
     free = [session.initial_points.free, *(probe.new_points.free for probe in probes)]
@@ -101,7 +99,7 @@ def test_free_voxels_are_new_each_time_and_not_deep_in_the_object(drill: Run) ->
     assert len(points) - len(free[0]) > 2000
 
 
-def test_each_probe_returns_before_the_object_at_its_place_in_the_grid(drill: Run) -> None:
+def test_each_probe_returns_before_the_object_at_its_place_in_the_grid(drill):
     _, session, probes = drill
     assert [probe.step for probe in probes] == list(range(session.count))
     for probe, (y, z) in zip(probes, session.configuration.grid, strict=True):
@@ -113,7 +111,7 @@ def test_each_probe_returns_before_the_object_at_its_place_in_the_grid(drill: Ru
         np.testing.assert_array_equal(probe.gripper_path[0, :3, :3], ROTATION)
 
 
-def test_a_seed_fixes_every_bit_and_another_one_does_not() -> None:
+def test_a_seed_fixes_every_bit_and_another_one_does_not():
     first, again, other = (_run("box", seed=seed)[2] for seed in (3, 3, 4))
     for one, two in zip(first, again, strict=True):
         assert one.new_points.digest == two.new_points.digest
@@ -121,7 +119,7 @@ def test_a_seed_fixes_every_bit_and_another_one_does_not() -> None:
     assert first[0].new_points.digest != other[0].new_points.digest
 
 
-def test_boundaries_are_a_slab_below_the_floor_and_a_shell_of_the_workspace() -> None:
+def test_boundaries_are_a_slab_below_the_floor_and_a_shell_of_the_workspace():
     free, mesh = {}, load_model("spam_can").apply_scale(2.5)
     for boundary in ("floor_slab", "box_shell", "both"):
         session = open_probing("kinematic", mesh, "can", replace(DEFAULT, boundary=boundary), 0)
@@ -133,7 +131,7 @@ def test_boundaries_are_a_slab_below_the_floor_and_a_shell_of_the_workspace() ->
     assert len(free["both"]) < len(free["box_shell"]) + len(free["floor_slab"])
 
 
-def test_no_free_voxel_of_the_shell_is_in_an_object_that_reaches_out_of_its_workspace() -> None:
+def test_no_free_voxel_of_the_shell_is_in_an_object_that_reaches_out_of_its_workspace():
     mesh = load_model("hammer").apply_scale(2.5)
     shell = replace(DEFAULT, boundary="box_shell")
     session = open_probing("kinematic", mesh, "hammer_straight", shell, 0)

@@ -1,8 +1,3 @@
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import trimesh
@@ -17,19 +12,19 @@ BOX = ObjectModel("box", trimesh.creation.box((0.03, 0.04, 0.12)), 1.0, 0.001, "
 SURFACE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.2, 0.0]])
 
 
-def npz(folder: Path, **arrays: Any) -> Path:
+def npz(folder, **arrays):
     path = folder / "points.npz"
     np.savez(path, **arrays)
     return path
 
 
-def text(folder: Path, content: str, name: str = "points.csv") -> Path:
+def text(folder, content, name="points.csv"):
     path = folder / name
     path.write_text(content)
     return path
 
 
-def test_a_file_without_steps_is_one_probe(tmp_path: Path) -> None:
+def test_a_file_without_steps_is_one_probe(tmp_path):
     free = np.full((4, 3), 0.3)
     path = npz(tmp_path, surface=SURFACE, free=free, world_from_object=np.eye(4))
     session = PointsSession(PointsSettings(str(path)), BOX)
@@ -41,7 +36,7 @@ def test_a_file_without_steps_is_one_probe(tmp_path: Path) -> None:
     np.testing.assert_array_equal(session.world_from_object, np.eye(4))
 
 
-def test_steps_make_a_sequence_and_all_classes_arrive_at_theirs(tmp_path: Path) -> None:
+def test_steps_make_a_sequence_and_all_classes_arrive_at_theirs(tmp_path):
     path = npz(
         tmp_path,
         surface=SURFACE,
@@ -61,7 +56,7 @@ def test_steps_make_a_sequence_and_all_classes_arrive_at_theirs(tmp_path: Path) 
     assert len(last.contacts) == 3
 
 
-def test_csv_holds_every_kind_and_points_without_a_step_are_known_first(tmp_path: Path) -> None:
+def test_csv_holds_every_kind_and_points_without_a_step_are_known_first(tmp_path):
     rows = "x, y, z, kind, sdf, step\n0,0,0,surface,,0\n0.1,1e-1,.7,free,,\n"
     rows += "0,1,0, known ,-0.02,1\n2,2,2,occupied,, 1\n3,3,3,free,, \n"
     content = read_points(text(tmp_path, rows))
@@ -77,7 +72,7 @@ def test_csv_holds_every_kind_and_points_without_a_step_are_known_first(tmp_path
 
 
 @pytest.mark.parametrize("suffix", ["ply", "off", "stl", "xyz"])
-def test_vertices_of_meshes_and_clouds_are_surface_points(tmp_path: Path, suffix: str) -> None:
+def test_vertices_of_meshes_and_clouds_are_surface_points(tmp_path, suffix):
     path = tmp_path / f"points.{suffix}"
     if suffix == "xyz":
         np.savetxt(path, SURFACE)
@@ -88,7 +83,7 @@ def test_vertices_of_meshes_and_clouds_are_surface_points(tmp_path: Path, suffix
     np.testing.assert_allclose(found, SURFACE[np.lexsort(SURFACE.T)], atol=1e-7)
 
 
-def test_vertices_beside_the_faces_are_points_too(tmp_path: Path) -> None:
+def test_vertices_beside_the_faces_are_points_too(tmp_path):
     off = "OFF\n5 1 0\n0 0 0\n1 0 0\n0 1 0\n0 0 0\n{} 2 2\n3 0 1 2\n"
     found = read_points(text(tmp_path, off.format("2"), "points.off")).at(0).known
     expected = [[0, 0, 0], [0, 0, 0], [0, 1, 0], [1, 0, 0], [2, 2, 2]]
@@ -113,12 +108,12 @@ def test_vertices_beside_the_faces_are_points_too(tmp_path: Path) -> None:
         ({"surface": np.array([[object()] * 3])}, "not a readable .npz"),
     ],
 )
-def test_malformed_arrays_are_named(tmp_path: Path, arrays: dict[str, Any], message: str) -> None:
+def test_malformed_arrays_are_named(tmp_path, arrays, message):
     with pytest.raises(PointsError, match=rf"points.npz.*{message}"):
         read_points(npz(tmp_path, **arrays))
 
 
-def test_arrays_larger_than_the_limit_are_refused_before_they_are_unpacked(tmp_path: Path) -> None:
+def test_arrays_larger_than_the_limit_are_refused_before_they_are_unpacked(tmp_path):
     path = tmp_path / "points.npz"
     np.savez_compressed(path, free=np.zeros((100_000, 3)))
     assert path.stat().st_size < 20_000
@@ -147,12 +142,12 @@ def test_arrays_larger_than_the_limit_are_refused_before_they_are_unpacked(tmp_p
         ("", "not a readable .csv file"),
     ],
 )
-def test_malformed_rows_are_named(tmp_path: Path, content: str, message: str) -> None:
+def test_malformed_rows_are_named(tmp_path, content, message):
     with pytest.raises(PointsError, match=rf"points.csv.*{message}"):
         read_points(text(tmp_path, content))
 
 
-def test_files_that_are_not_what_their_suffix_says_are_refused(tmp_path: Path) -> None:
+def test_files_that_are_not_what_their_suffix_says_are_refused(tmp_path):
     for suffix in ("npz", "ply", "off", "stl", "csv", "xyz"):
         path = tmp_path / f"noise.{suffix}"
         path.write_bytes(b"\xff\x00\x81" * 50)
@@ -164,7 +159,7 @@ def test_files_that_are_not_what_their_suffix_says_are_refused(tmp_path: Path) -
         read_points(tmp_path / "nothing.npz")
 
 
-def test_workspace_is_that_of_the_points_padded_by_the_diameter(tmp_path: Path) -> None:
+def test_workspace_is_that_of_the_points_padded_by_the_diameter(tmp_path):
     path = str(npz(tmp_path, surface=SURFACE, free=SURFACE - 1.0))
     lower, upper = PointsSession(PointsSettings(path), BOX).workspace.bounds
     diameter = object_grid(BOX.mesh).diameter

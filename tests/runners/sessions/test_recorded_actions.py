@@ -1,7 +1,5 @@
 """Recorded grids, taken in any order."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +8,7 @@ import pytest
 
 from chsel.errors import SessionError
 from chsel.next_probe.action_lattice import ActionSettings, ReachBall
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Lattice
-from replay.events import Probe
 from runners.objects.loader import load_model
 from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.probing import open_probing, swept_voxels
@@ -28,13 +24,13 @@ GRIDS = [
 ]
 
 
-def opened(name: str) -> tuple[RecordedSession, list[Probe]]:
+def opened(name):
     session = RecordedSession(RecordedSettings(path=str(REPLAYS / f"{name}.mcap")))
     return session, list(session.probes())
 
 
 @pytest.mark.parametrize(("name", "configuration"), GRIDS)
-def test_a_recorded_grid_is_offered_as_its_probes(name: str, configuration: str) -> None:
+def test_a_recorded_grid_is_offered_as_its_probes(name, configuration):
     session, probes = opened(name)
     reach = ReachBall((0.0, 0.0, 0.0), 1e-6)
     actions = session.offer(ActionSettings(choice="forward", reach=reach, speed=0.1))
@@ -48,7 +44,7 @@ def test_a_recorded_grid_is_offered_as_its_probes(name: str, configuration: str)
     np.testing.assert_allclose(session.hand.bounds[1, 2], 0.1123)
 
 
-def test_in_the_recorded_order_all_points_are_as_recorded() -> None:
+def test_in_the_recorded_order_all_points_are_as_recorded():
     session, probes = opened(GRIDS[0][0])
     session.offer(ActionSettings())
     for step, before in enumerate(probes):
@@ -57,7 +53,7 @@ def test_in_the_recorded_order_all_points_are_as_recorded() -> None:
 
 
 @pytest.mark.parametrize("name", [name for name, _ in GRIDS])
-def test_in_any_order_the_same_is_known_in_the_end(name: str) -> None:
+def test_in_any_order_the_same_is_known_in_the_end(name):
     session, probes = opened(name)
     session.offer(ActionSettings())
     order = np.random.default_rng(0).permutation(len(probes)).tolist()
@@ -76,11 +72,11 @@ def test_in_any_order_the_same_is_known_in_the_end(name: str) -> None:
     np.testing.assert_array_equal(in_order(np.concatenate(free)), in_order(recorded))
 
 
-def in_order(points: FloatArray) -> FloatArray:
+def in_order(points):
     return points[np.lexsort(points.T)]
 
 
-def test_a_probe_that_is_taken_first_shows_nearly_all_that_it_swept() -> None:
+def test_a_probe_that_is_taken_first_shows_nearly_all_that_it_swept():
     mesh = load_model("mustard").apply_scale(2.5)
     session = open_probing("kinematic", mesh, "mustard", ProbingSettings(), 0)
     probes, swept = [], []
@@ -101,7 +97,7 @@ def test_a_probe_that_is_taken_first_shows_nearly_all_that_it_swept() -> None:
     assert len(new - initially - true) < 0.02 * len(true)
 
 
-def test_what_cannot_be_steered_is_an_error(tmp_path: Path) -> None:
+def test_what_cannot_be_steered_is_an_error(tmp_path):
     session, _ = opened("points_mustard")
     with pytest.raises(SessionError, match=r"points_mustard.mcap does not describe the hand"):
         session.offer(ActionSettings())

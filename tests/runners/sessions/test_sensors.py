@@ -1,10 +1,6 @@
 """Sessions of raw logs: known answers, and logs that lack something."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,11 +8,10 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
 from chsel.errors import SessionError, SettingError
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
 from replay.events import Logged, Probe, RigDescribed, SensorImage
 from runners.sensors.pose_file import beside, write_pose
-from runners.sensors.rig import Annotations, CloudRig, ExtraContacts, HandRig, ProbeTimes, Rig
+from runners.sensors.rig import Annotations, CloudRig, ExtraContacts, HandRig, ProbeTimes
 from runners.sessions.sensors import SensorsSession, SensorsSettings
 from tests.replay.conftest import same_bits
 from tests.runners.sensors.foxglove_log import in_foxgloves_messages
@@ -42,33 +37,33 @@ DIAGONAL = 3**0.5 * SPACING
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(tmp_path_factory):
     return SphereLog().write(tmp_path_factory.mktemp("log") / "sphere.mcap")
 
 
 @pytest.fixture(scope="module")
-def events(log: Path) -> list[Any]:
+def events(log):
     return list(open_log(log).probes())
 
 
-def open_log(path: Path, rig: Rig = RIG, seed: int = 0, **changes: Any) -> SensorsSession:
+def open_log(path, rig=RIG, seed=0, **changes):
     return SensorsSession(SensorsSettings(rig, str(path), **changes), seed)
 
 
-def probes(events: Any) -> list[Probe]:
+def probes(events):
     return [event for event in events if isinstance(event, Probe)]
 
 
-def free_of(events: Any) -> FloatArray:
+def free_of(events):
     return np.concatenate([probe.new_points.free for probe in probes(events)])
 
 
-def lines(events: Any, level: str = "warning") -> str:
+def lines(events, level="warning"):
     found = [event for event in events if isinstance(event, Logged) and event.level == level]
     return "\n".join(event.text for event in found)
 
 
-def test_contacts_lie_on_what_was_touched(events: list[Any]) -> None:
+def test_contacts_lie_on_what_was_touched(events):
     touching, passing = probes(events)
     assert (touching.step, touching.outcome) == (0, "contact")
     assert (passing.step, passing.outcome) == (1, "free")
@@ -84,7 +79,7 @@ def test_contacts_lie_on_what_was_touched(events: list[Any]) -> None:
     assert touching.contacts[:, 0].max() < CENTRE[0]
 
 
-def test_free_space_is_where_rays_passed_and_the_hand_went(events: list[Any], log: Path) -> None:
+def test_free_space_is_where_rays_passed_and_the_hand_went(events, log):
     free = np.concatenate([open_log(log).initial_points.free, free_of(events)])
     assert len(np.unique(np.rint(free / 1e-6).astype(int), axis=0)) == len(free)
     assert heights(free).min() > -DIAGONAL
@@ -105,7 +100,7 @@ def test_free_space_is_where_rays_passed_and_the_hand_went(events: list[Any], lo
     assert known.query(np.add(CENTRE, [0.5 * RADIUS, 0.0, 0.0]))[0] > 0.01  # behind
 
 
-def test_a_pad_frees_what_is_before_its_membrane_and_nothing_behind_it(log: Path) -> None:
+def test_a_pad_frees_what_is_before_its_membrane_and_nothing_behind_it(log):
     free = free_of(open_log(log, replace(RIG, cameras=(), hand=None)).probes())
     assert len(free) > 100
     # A voxel is marked up to half its diagonal before the membrane, so no centre is in the sphere,
@@ -119,7 +114,7 @@ def test_a_pad_frees_what_is_before_its_membrane_and_nothing_behind_it(log: Path
     assert cKDTree(free).query(before, p=np.inf)[0] <= 0.5 * SPACING + 1e-9
 
 
-def test_images_come_ahead_of_their_probe(events: list[Any], log: Path) -> None:
+def test_images_come_ahead_of_their_probe(events, log):
     kinds = [type(event) for event in events]
     assert kinds[0] is RigDescribed
     assert (events[0].name, events[0].step, events[0].hand.is_watertight) == ("sphere", -1, True)
@@ -145,9 +140,7 @@ def test_images_come_ahead_of_their_probe(events: list[Any], log: Path) -> None:
     np.testing.assert_allclose(furthest[:3, 3], hand_pose(2.0)[:3, 3], atol=0.003)
 
 
-def test_the_seed_chooses_among_contact_pixels_and_changes_nothing_else(
-    events: list[Any], log: Path
-) -> None:
+def test_the_seed_chooses_among_contact_pixels_and_changes_nothing_else(events, log):
     session = open_log(log)  # which can be read twice
     assert len(list(session.probes())) == len(events)
     again = probes(session.probes())[0]
@@ -159,7 +152,7 @@ def test_the_seed_chooses_among_contact_pixels_and_changes_nothing_else(
     assert not np.array_equal(other.contacts, first.contacts)
 
 
-def test_contacts_count_between_begin_and_end_alone(tmp_path: Path, log: Path) -> None:
+def test_contacts_count_between_begin_and_end_alone(tmp_path, log):
     marks = ((0.5, "begin 3"), (1.2, "end 3"), (2.8, "begin 4"), (4.9, "end 4"))
     found = probes(open_log(SphereLog(marks=marks).write(tmp_path / "log.mcap")).probes())
     assert [(probe.step, probe.outcome) for probe in found] == [(3, "free"), (4, "free")]
@@ -176,7 +169,7 @@ def test_contacts_count_between_begin_and_end_alone(tmp_path: Path, log: Path) -
         open_log(log, rig)
 
 
-def test_annotations_leave_out_and_add_contacts(log: Path) -> None:
+def test_annotations_leave_out_and_add_contacts(log):
     added = ((0.9, 0.01, 0.41), (9.0, 0.0, 0.4), (0.9, 0.0, 0.41))
     annotations = Annotations((0,), (ExtraContacts(1, added), ExtraContacts(7, added)))
     events = list(open_log(log, replace(RIG, annotations=annotations)).probes())
@@ -198,7 +191,7 @@ HAND_URDF = """<robot name="hand"><link name="flange"/>
     <origin xyz="0 -0.02 0.04"/><axis xyz="0 1 0"/></joint></robot>"""
 
 
-def test_a_hand_of_a_urdf_sweeps_what_its_boxes_sweep(tmp_path: Path) -> None:
+def test_a_hand_of_a_urdf_sweeps_what_its_boxes_sweep(tmp_path):
     pytest.importorskip("yourdfpy")
     (tmp_path / "hand.urdf").write_text(HAND_URDF)
     linked = HandRig("hand", urdf=str(tmp_path / "hand.urdf"), joints="/joint_states")
@@ -220,9 +213,7 @@ def test_a_hand_of_a_urdf_sweeps_what_its_boxes_sweep(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_a_log_of_foxgloves_messages_gives_the_same_to_the_bit(
-    events: list[Any], log: Path, tmp_path: Path, packed: bool
-) -> None:
+def test_a_log_of_foxgloves_messages_gives_the_same_to_the_bit(events, log, tmp_path, packed):
     other = in_foxgloves_messages(log, tmp_path / "foxglove.mcap", packed=packed)
     again = list(open_log(other).probes())
     assert again[0].source != events[0].source
@@ -231,7 +222,7 @@ def test_a_log_of_foxgloves_messages_gives_the_same_to_the_bit(
         assert same_bits(one, before), f"{type(one).__name__} of probe {one.step}"
 
 
-def test_clouds_are_rays_or_surface_or_contacts(tmp_path: Path) -> None:
+def test_clouds_are_rays_or_surface_or_contacts(tmp_path):
     cloud = ((0.2, 0.0, 0.0), (0.2, 0.0, 0.001), (np.nan, 0.0, 0.0), (9.0, 0.0, 0.0))
     log = SphereLog(cloud=cloud).write(tmp_path / "log.mcap")
     clouds = CloudRig("/lidar", "rays"), CloudRig("/skin", "contacts")
@@ -254,7 +245,7 @@ def test_clouds_are_rays_or_surface_or_contacts(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("role", ["surface", "contacts", "rays"])
-def test_a_topic_whose_points_are_all_out_of_reach_is_a_warning(tmp_path: Path, role: str) -> None:
+def test_a_topic_whose_points_are_all_out_of_reach_is_a_warning(tmp_path, role):
     """Here, as they are in millimetres."""
     cloud = ((200.0, 0.0, 0.0), (200.0, 0.0, 1.0), (np.nan, 0.0, 0.0))
     log = SphereLog(cloud=cloud).write(tmp_path / "log.mcap")
@@ -292,15 +283,13 @@ WRONG = {
         ({}, WRONG["reference"], r"pad has images of deformation and no reference"),
     ],
 )
-def test_a_log_that_lacks_something_says_so(
-    tmp_path: Path, written: dict[str, Any], changes: dict[str, Any], message: str
-) -> None:
+def test_a_log_that_lacks_something_says_so(tmp_path, written, changes, message):
     log = SphereLog(**written).write(tmp_path / "log.mcap")
     with pytest.raises((SessionError, SettingError), match=message):
         open_log(log, replace(RIG, **changes))
 
 
-def test_a_hole_in_the_transforms_costs_the_images_within(tmp_path: Path) -> None:
+def test_a_hole_in_the_transforms_costs_the_images_within(tmp_path):
     log = SphereLog(lost_transforms=(3.4, 4.6)).write(tmp_path / "log.mcap")
     session = open_log(log)
     events = list(session.probes())
@@ -313,7 +302,7 @@ def test_a_hole_in_the_transforms_costs_the_images_within(tmp_path: Path) -> Non
     assert steps.max() > 0.02 or len(second.gripper_path) < 20
 
 
-def test_a_camera_whose_clock_is_ahead_is_put_right(tmp_path: Path, events: list[Any]) -> None:
+def test_a_camera_whose_clock_is_ahead_is_put_right(tmp_path, events):
     log = SphereLog(camera_clock=100.0).write(tmp_path / "log.mcap")
     ahead = list(open_log(log).probes())
     assert "/camera/depth is 100 s ahead of other topics'" in lines(ahead)
@@ -321,7 +310,7 @@ def test_a_camera_whose_clock_is_ahead_is_put_right(tmp_path: Path, events: list
         assert one.new_points.digest == other.new_points.digest
 
 
-def test_a_pose_beside_the_log_is_the_true_one(tmp_path: Path) -> None:
+def test_a_pose_beside_the_log_is_the_true_one(tmp_path):
     log = SphereLog().write(tmp_path / "log.mcap")
     assert open_log(log).world_from_object is None
     pose = np.eye(4)
@@ -337,7 +326,7 @@ def test_a_pose_beside_the_log_is_the_true_one(tmp_path: Path) -> None:
         SensorsSettings(RIG)
 
 
-def test_the_reference_of_a_pad_can_be_a_file(log: Path, tmp_path: Path) -> None:
+def test_the_reference_of_a_pad_can_be_a_file(log, tmp_path):
     np.save(tmp_path / "small.npy", np.full((4, 4), 0.06))
     pad = replace(RIG.bubbles[0], reference=str(tmp_path / "small.npy"))
     with pytest.raises(SessionError, match=r"reference of pad has 4 x 4 pixels; accepted: .* 48 x"):

@@ -47,13 +47,13 @@ class _Pair:
     kinematic: list[Probe]
 
 
-def _mesh(configuration_name: str) -> trimesh.Trimesh:
+def _mesh(configuration_name):
     name = CONFIGURATIONS[configuration_name].object
     return load_model(name).apply_scale(SCALES.get(name, 2.5))
 
 
 @pytest.fixture(scope="module", params=list(CONFIGURATIONS))
-def pair(request: pytest.FixtureRequest) -> _Pair:
+def pair(request):
     mesh = _mesh(request.param)
     simulated = open_probing("simulated", mesh, request.param, ProbingSettings(), 0)
     kinematic = open_probing("kinematic", mesh, request.param, ProbingSettings(), 0)
@@ -63,7 +63,7 @@ def pair(request: pytest.FixtureRequest) -> _Pair:
     return _Pair(mesh, simulated.world_from_object, *both)
 
 
-def test_contacts_agree_with_plain_geometry_to_3_mm(pair: _Pair) -> None:
+def test_contacts_agree_with_plain_geometry_to_3_mm(pair):
     distances = []
     for simulated, kinematic in zip(pair.simulated, pair.kinematic, strict=True):
         assert simulated.outcome == kinematic.outcome
@@ -77,7 +77,7 @@ def test_contacts_agree_with_plain_geometry_to_3_mm(pair: _Pair) -> None:
     assert max(distances) < 0.010
 
 
-def _touching(pair: _Pair, probe: Probe, near: FloatArray) -> FloatArray:
+def _touching(pair, probe, near):
     """Where on the object (N, 3) the hand of a probe, at its furthest, all but touches it."""
     ends = probe.gripper_path[:, :3, 3]
     surface = panda_hand().surface_points(0.001) + ends[np.argmax(ends[:, 0])]
@@ -88,18 +88,18 @@ def _touching(pair: _Pair, probe: Probe, near: FloatArray) -> FloatArray:
     return apply(pair.world_from_object, onto[distance < PRESSED])
 
 
-def _distances(point: FloatArray, points: FloatArray) -> FloatArray:
+def _distances(point, points):
     return np.sqrt(((points - point) ** 2).sum(axis=1))
 
 
-def test_each_configuration_has_four_contacts_all_of_them_on_the_surface(pair: _Pair) -> None:
+def test_each_configuration_has_four_contacts_all_of_them_on_the_surface(pair):
     contacts = np.concatenate([probe.contacts for probe in pair.simulated])
     assert len(contacts) >= 4
     points = apply(inverse(pair.world_from_object), contacts)
     assert np.abs(mesh_sdf(pair.mesh, points)[0]).max() < 0.001
 
 
-def test_free_space_is_nearly_that_of_plain_geometry(pair: _Pair) -> None:
+def test_free_space_is_nearly_that_of_plain_geometry(pair):
     free, other = (
         np.concatenate([probe.new_points.free for probe in probes])
         for probes in (pair.simulated, pair.kinematic)
@@ -111,9 +111,7 @@ def test_free_space_is_nearly_that_of_plain_geometry(pair: _Pair) -> None:
     assert inside.min() > -tolerance
 
 
-def test_the_settled_object_lies_on_the_floor_where_geometry_has_laid_it(
-    pair: _Pair, request: pytest.FixtureRequest
-) -> None:
+def test_the_settled_object_lies_on_the_floor_where_geometry_has_laid_it(pair, request):
     assert lowest(pair.mesh, pair.world_from_object) == pytest.approx(0.0, abs=1e-9)
     laid = laid_down(pair.mesh, CONFIGURATIONS[request.node.callspec.params["pair"]])
     vertices = np.asarray(pair.mesh.vertices)
@@ -121,7 +119,7 @@ def test_the_settled_object_lies_on_the_floor_where_geometry_has_laid_it(
     assert np.sqrt((moved**2).sum(axis=1)).max() < 0.001
 
 
-def test_a_seed_gives_the_same_bytes_in_every_process() -> None:
+def test_a_seed_gives_the_same_bytes_in_every_process():
     command = [sys.executable, "-c", DIGESTS]
     outputs = [subprocess.check_output(command, text=True) for _ in range(2)]
     assert outputs[0] == outputs[1]
@@ -129,7 +127,7 @@ def test_a_seed_gives_the_same_bytes_in_every_process() -> None:
     assert "contact" in outputs[0]
 
 
-def test_contacts_can_be_with_the_convex_parts(capfd: pytest.CaptureFixture[str]) -> None:
+def test_contacts_can_be_with_the_convex_parts(capfd):
     settings = ProbingSettings(collision_mesh="vhacd")
     session = open_probing("simulated", _mesh("can"), "can", settings, 0)
     assert len(next(session.probes()).contacts) >= 1
@@ -137,9 +135,7 @@ def test_contacts_can_be_with_the_convex_parts(capfd: pytest.CaptureFixture[str]
     assert capfd.readouterr().out == ""  # the decomposition is talkative
 
 
-def test_without_pybullet_the_error_names_the_other_session(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_pybullet_the_error_names_the_other_session(monkeypatch):
     monkeypatch.setitem(sys.modules, "pybullet", None)
     with pytest.raises(SessionError, match="session=kinematic"):
         open_probing("simulated", _mesh("can"), "can", ProbingSettings(), 0)

@@ -1,13 +1,9 @@
 """Probes in any direction, in both engines."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 from itertools import islice
 
 import numpy as np
 import pytest
-import trimesh
 
 from chsel.errors import SessionError
 from chsel.next_probe.action_lattice import ActionSettings
@@ -17,12 +13,12 @@ from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
 from runners.objects.loader import load_model
 from runners.sessions.gripper import X_REST
-from runners.sessions.probing import ProbingSession, open_probing
+from runners.sessions.probing import open_probing
 from runners.sessions.probing_settings import ProbingSettings
 
 
 @pytest.fixture(params=["kinematic", "simulated"])
-def session(request: pytest.FixtureRequest) -> Iterator[ProbingSession]:
+def session(request):
     if request.param == "simulated":
         pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
     opened = open_probing(request.param, _mustard(), "mustard", ProbingSettings(), 0)
@@ -30,13 +26,11 @@ def session(request: pytest.FixtureRequest) -> Iterator[ProbingSession]:
     opened.close()
 
 
-def _mustard() -> trimesh.Trimesh:
+def _mustard():
     return load_model("mustard").apply_scale(2.5)
 
 
-def test_a_probe_goes_straight_along_the_hand_and_meets_what_is_forecast(
-    session: ProbingSession,
-) -> None:
+def test_a_probe_goes_straight_along_the_hand_and_meets_what_is_forecast(session):
     mesh, actions = _mustard(), session.offer(ActionSettings())
     chosen = np.linspace(0, len(actions) - 1, 9).astype(int).tolist()
     taken = [(action, next(session.take(step, action))) for step, action in enumerate(chosen)]
@@ -75,7 +69,7 @@ def test_a_probe_goes_straight_along_the_hand_and_meets_what_is_forecast(
     assert np.median(off) < 0.015
 
 
-def test_an_action_is_taken_once(session: ProbingSession) -> None:
+def test_an_action_is_taken_once(session):
     actions = session.offer(ActionSettings(choice="forward", spacing=0.2))
     assert session.available().all()
     next(iter(session.take(0, 2)))
@@ -86,7 +80,7 @@ def test_an_action_is_taken_once(session: ProbingSession) -> None:
         next(iter(session.take(1, len(actions))))
 
 
-def test_the_grid_as_actions_has_the_outcomes_of_the_grid() -> None:
+def test_the_grid_as_actions_has_the_outcomes_of_the_grid():
     paper = open_probing("kinematic", _mustard(), "mustard", ProbingSettings(), 0)
     grid = list(islice(paper.probes(), 3))
     session = open_probing("kinematic", _mustard(), "mustard", ProbingSettings(), 0)
@@ -102,7 +96,7 @@ def test_the_grid_as_actions_has_the_outcomes_of_the_grid() -> None:
             assert np.sqrt((away**2).sum(axis=2)).min() < 0.005
 
 
-def test_a_hand_that_would_start_in_the_object_comes_from_behind(session: ProbingSession) -> None:
+def test_a_hand_that_would_start_in_the_object_comes_from_behind(session):
     assert session.world_from_object is not None
     centre = apply(session.world_from_object, _mustard().center_mass[None])[0]
     actions = session.offer(ActionSettings())

@@ -1,7 +1,5 @@
 """The membrane: its shape untouched, and what gives way where."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -14,11 +12,11 @@ APEX = CAP_BASE + CAP[2]
 
 
 @pytest.fixture(scope="module")
-def membrane() -> Membrane:
+def membrane():
     return Membrane(CAMERA)
 
 
-def test_the_untouched_membrane_is_half_an_ellipsoid(membrane: Membrane) -> None:
+def test_the_untouched_membrane_is_half_an_ellipsoid(membrane):
     x, y = CAMERA.directions()[..., :2].transpose(2, 0, 1)
     points = np.stack([x * membrane.rest, y * membrane.rest, membrane.rest - CAP_BASE], axis=-1)
     soft = membrane.rest > CAP_BASE
@@ -29,7 +27,7 @@ def test_the_untouched_membrane_is_half_an_ellipsoid(membrane: Membrane) -> None
     assert 0.7 < soft.mean() < 0.8  # an ellipse in its rectangle: pi / 4
 
 
-def test_a_plane_flattens_what_it_reaches(membrane: Membrane) -> None:
+def test_a_plane_flattens_what_it_reaches(membrane):
     plane = APEX - 0.005
     depth = membrane.pressed(np.full(membrane.rest.shape, plane))
     reached = membrane.rest > plane
@@ -42,14 +40,14 @@ def test_a_plane_flattens_what_it_reaches(membrane: Membrane) -> None:
     assert (depth[~reached] < membrane.rest[~reached]).any()
 
 
-def test_no_object_goes_through_the_base(membrane: Membrane) -> None:
+def test_no_object_goes_through_the_base(membrane):
     depth = membrane.pressed(np.full(membrane.rest.shape, 0.02))
     assert (depth >= np.minimum(membrane.rest, CAP_BASE)).all()
     assert (depth[membrane.rest <= CAP_BASE] == CAP_BASE).all()
 
 
 @pytest.mark.parametrize("width", [224, 112])
-def test_beside_a_straight_edge_the_dent_falls_as_that_of_a_taut_sheet(width: int) -> None:
+def test_beside_a_straight_edge_the_dent_falls_as_that_of_a_taut_sheet(width):
     camera = BubbleSettings(width=width).pinhole
     wide = Membrane(camera)
     beyond = np.full(wide.rest.shape, 1.0)

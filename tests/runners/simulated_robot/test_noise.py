@@ -1,7 +1,5 @@
 """Noise whose size is known: where it is small, and how much worse it is at edges."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -21,12 +19,12 @@ NEAR, FAR = 0.5, 0.9
 LEFT, RIGHT = 120, 200  # columns of a bar before a wall
 
 
-def stream(index: int = 0) -> np.random.Generator:
+def stream(index=0):
     return StreamKey(7, 0).stream(Purpose.SENSOR_NOISE, index)
 
 
 @pytest.fixture(scope="module")
-def bar() -> tuple[np.ndarray, np.ndarray]:
+def bar():
     """True depths of a bar before a wall, metres, and measured ones, millimetres."""
     depth = np.full((PINHOLE.height, PINHOLE.width), FAR)
     depth[:, LEFT:RIGHT] = NEAR
@@ -34,7 +32,7 @@ def bar() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("distance", [0.5, 1.0, 2.0])
-def test_noise_away_from_edges_grows_with_the_depth_squared(distance: float) -> None:
+def test_noise_away_from_edges_grows_with_the_depth_squared(distance):
     measured = stereo_depth(np.full((PINHOLE.height, PINHOLE.width), distance), PINHOLE, stream())
     assert measured.dtype == np.uint16
     error = measured[measured > 0] / 1000.0 - distance
@@ -44,7 +42,7 @@ def test_noise_away_from_edges_grows_with_the_depth_squared(distance: float) -> 
     assert (measured == 0).mean() == pytest.approx(LOST, rel=0.2)
 
 
-def test_edges_are_where_the_camera_is_worst(bar: tuple[np.ndarray, np.ndarray]) -> None:
+def test_edges_are_where_the_camera_is_worst(bar):
     depth, measured = bar
     wrong = (measured > 0) & (np.abs(measured / 1000.0 - depth) > 0.05)
     columns = np.arange(PINHOLE.width)
@@ -60,9 +58,7 @@ def test_edges_are_where_the_camera_is_worst(bar: tuple[np.ndarray, np.ndarray])
     assert not between[:, (np.abs(columns - LEFT) >= 12) & (np.abs(columns - RIGHT) >= 12)].any()
 
 
-def test_the_shadow_of_the_second_eye_is_as_wide_as_geometry_says(
-    bar: tuple[np.ndarray, np.ndarray],
-) -> None:
+def test_the_shadow_of_the_second_eye_is_as_wide_as_geometry_says(bar):
     _, measured = bar
     width = PINHOLE.fx * BASELINE * (1.0 / NEAR - 1.0 / FAR)
     lost = (measured == 0).mean(axis=0)
@@ -72,7 +68,7 @@ def test_the_shadow_of_the_second_eye_is_as_wide_as_geometry_says(
     assert lost[RIGHT + 8] < 0.1  # only on the left, as the second eye is on the right
 
 
-def test_a_bubble_camera_is_noisy_by_what_it_says() -> None:
+def test_a_bubble_camera_is_noisy_by_what_it_says():
     measured = bubble_depth(np.full((171, 224), 0.07), stream())
     assert measured.dtype == np.float32
     good = measured[measured > 0]

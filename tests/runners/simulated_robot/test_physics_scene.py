@@ -1,9 +1,6 @@
 """Objects in the cabinet; the engine's depth images and contacts against exact geometry."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Iterator
 from contextlib import closing
 
 import numpy as np
@@ -11,13 +8,12 @@ import pytest
 import trimesh
 
 from chsel.errors import SessionError
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
 from runners.objects.loader import load_model
 from runners.simulated_robot import cabinet
 from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS, REST, SHELF, stood_on_shelf
 from runners.simulated_robot.physics_scene import NEAR, PhysicsScene
-from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RenderedCamera
+from runners.simulated_robot.settings import BubbleSettings, CameraSettings
 
 pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
 
@@ -28,18 +24,18 @@ EXACT = 2e-5  # m
 
 
 @pytest.fixture(scope="module")
-def scene() -> Iterator[PhysicsScene]:
+def scene():
     with closing(PhysicsScene(MESH, POSE)) as scene:
         yield scene
 
 
-def solid(hand: bool) -> trimesh.Trimesh:
+def solid(hand):
     parts = [cabinet.mesh_of(cabinet.CABINET + cabinet.ROOM), MESH.copy().apply_transform(POSE)]
     parts += [cabinet.whole_mesh().apply_transform(HAND)] if hand else []
     return trimesh.util.concatenate(parts)
 
 
-def cast(mesh: trimesh.Trimesh, camera: RenderedCamera, pose: FloatArray) -> FloatArray:
+def cast(mesh, camera, pose):
     """Depth (H, W) of the first hit of every pixel's ray; camera.far where there is none."""
     x, y, _ = camera.directions().reshape(-1, 3).T
     directions = np.stack([x, y, np.ones(len(x))], axis=1) @ pose[:3, :3].T
@@ -50,19 +46,19 @@ def cast(mesh: trimesh.Trimesh, camera: RenderedCamera, pose: FloatArray) -> Flo
     return depth.reshape(camera.height, camera.width)
 
 
-def agreement(seen: FloatArray, exact: FloatArray) -> float:
+def agreement(seen, exact):
     """Part of the pixels that agree; along silhouettes a ray may pass on either side."""
     return float((np.abs(seen - exact) < EXACT).mean())
 
 
 @pytest.mark.parametrize("hand", [False, True])
-def test_the_outer_camera_sees_exact_depths(scene: PhysicsScene, hand: bool) -> None:
+def test_the_outer_camera_sees_exact_depths(scene, hand):
     camera, pose = CameraSettings(width=160).pinhole, cabinet.world_from_camera()
     seen = scene.depth(camera, pose, *[HAND] * hand)
     assert agreement(seen, cast(solid(hand), camera, pose)) > 0.998
 
 
-def test_a_bubble_camera_sees_the_object_but_not_its_own_housing(scene: PhysicsScene) -> None:
+def test_a_bubble_camera_sees_the_object_but_not_its_own_housing(scene):
     camera = BubbleSettings(width=112).pinhole
     pose = HAND @ cabinet.wrist_from_bubble_camera("right")
     seen = scene.depth(camera, pose)
@@ -70,7 +66,7 @@ def test_a_bubble_camera_sees_the_object_but_not_its_own_housing(scene: PhysicsS
     assert seen.min() > 0.06
 
 
-def test_clearance_is_the_distance_to_what_is_nearest(scene: PhysicsScene) -> None:
+def test_clearance_is_the_distance_to_what_is_nearest(scene):
     side = cabinet.mesh_of(cabinet.rigid_parts()).bounds[1, 1]  # the hand's y is the world's
     for gap in (0.010, 0.003, -0.002):
         beside_wall = np.array([0.75, 0.22 - gap - side, 0.45])
@@ -80,7 +76,7 @@ def test_clearance_is_the_distance_to_what_is_nearest(scene: PhysicsScene) -> No
 
 
 @pytest.mark.parametrize("name", CABINET_CONFIGURATIONS)
-def test_objects_stand_on_the_shelf_within_the_workspace(name: str) -> None:
+def test_objects_stand_on_the_shelf_within_the_workspace(name):
     configuration = CABINET_CONFIGURATIONS[name]
     mesh = load_model(configuration.object)
     pose = stood_on_shelf(mesh, configuration)
@@ -93,7 +89,7 @@ def test_objects_stand_on_the_shelf_within_the_workspace(name: str) -> None:
         stood_on_shelf(mesh.apply_scale(2.5), configuration)
 
 
-def test_a_missing_engine_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_engine_is_said(monkeypatch):
     monkeypatch.setitem(sys.modules, "pybullet", None)
     with pytest.raises(SessionError, match="PyBullet is not installed"):
         PhysicsScene(MESH, POSE)

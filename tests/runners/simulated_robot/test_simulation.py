@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from replay.events import Probe
@@ -41,19 +40,19 @@ class Log:
     truth: SimulatedLog
     messages: list[Received]
 
-    def on(self, topic: str) -> list[Received]:
+    def on(self, topic):
         return [message for message in self.messages if message.topic == topic]
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
+def log(tmp_path_factory):
     path = tmp_path_factory.mktemp("simulated") / "small.mcap"
     truth = simulate_log(path, CONFIGURATION, MESH, SEED, SMALL)
     raw = RawLog(path)
     return Log(path, truth, list(raw.messages(raw.topics)))
 
 
-def test_messages_are_logged_a_little_later_than_they_are_sent(log: Log) -> None:
+def test_messages_are_logged_a_little_later_than_they_are_sent(log):
     for topic in ("/camera/depth/image_raw", "/bubble_left/depth/image_raw", "/joint_states"):
         late = np.array([message.log_time - (message.stamp or 0) for message in log.on(topic)])
         assert 0 < late.min() < late.max() < 0.05e9
@@ -63,7 +62,7 @@ def test_messages_are_logged_a_little_later_than_they_are_sent(log: Log) -> None
     assert stamps[0] == START
 
 
-def test_pushes_end_where_the_pads_feel_the_bottle(log: Log) -> None:
+def test_pushes_end_where_the_pads_feel_the_bottle(log):
     front = apply(log.truth.world_from_object, MESH.vertices)[:, 0].min()
     for push, (y, z) in zip(log.truth.pushes, CONFIGURATION.grid, strict=False):
         assert push.stopped == "pads"
@@ -72,14 +71,14 @@ def test_pushes_end_where_the_pads_feel_the_bottle(log: Log) -> None:
         assert abs(push.z - REST[2] - z) < 0.01
 
 
-def test_contacts_lie_on_the_object_and_free_space_beside_it(log: Log) -> None:
+def test_contacts_lie_on_the_object_and_free_space_beside_it(log):
     rig = OmegaConf.to_container(OmegaConf.load(CONF / "session" / "rig" / "cabinet.yaml"))
     rig["cameras"][0]["edge_reach"] = 2  # of fewer pixels than usual
     session = SensorsSession(session_settings("sensors", {"path": str(log.path), "rig": rig}), 0)
     probes = [event for event in session.probes() if isinstance(event, Probe)]
     assert [len(probe.contacts) for probe in probes] == [50, 50]
 
-    def distance(points: list[FloatArray]) -> FloatArray:
+    def distance(points):
         object_from_world = inverse(log.truth.world_from_object)
         return mesh_sdf(MESH, apply(object_from_world, np.concatenate(points)))[0]
 
@@ -93,7 +92,7 @@ def test_contacts_lie_on_the_object_and_free_space_beside_it(log: Log) -> None:
     assert sum(counts.lost for counts in session.report.total().values()) == 0
 
 
-def test_the_outer_camera_sees_the_cabinet_where_it_is(log: Log) -> None:
+def test_the_outer_camera_sees_the_cabinet_where_it_is(log):
     image, info = (
         log.on(f"/camera/depth/{name}")[0].content for name in ("image_raw", "camera_info")
     )
@@ -109,7 +108,7 @@ def test_the_outer_camera_sees_the_cabinet_where_it_is(log: Log) -> None:
     assert near.any(axis=1).mean() > 0.8
 
 
-def test_the_same_arguments_give_the_same_bytes(tmp_path: Path) -> None:
+def test_the_same_arguments_give_the_same_bytes(tmp_path):
     paths = [tmp_path / name for name in ("one.mcap", "two.mcap", "other.mcap")]
     for path, seed in zip(paths, (SEED, SEED, SEED + 1), strict=True):
         simulate_log(path, CONFIGURATION, MESH, seed, TINY)

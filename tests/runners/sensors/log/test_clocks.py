@@ -11,13 +11,13 @@ SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND
 
 
-def received(topic: str, time: float, stamp: float | None) -> Received:
+def received(topic, time, stamp):
     """A message at seconds since BEGIN."""
     sent = None if stamp is None else BEGIN + round(stamp * SECOND)
     return Received(topic, BEGIN + round(time * SECOND), sent, "x")
 
 
-def gathered(offsets: dict[str, float], rig: ClockRig | None = None) -> Clocks:
+def gathered(offsets, rig=None):
     """Eleven messages a topic, whose stamps are off by so many seconds and some milliseconds."""
     clocks, random = Clocks(rig or ClockRig()), np.random.default_rng(0)
     static = TransformMessage("a", "b", np.eye(4), static=True)  # of long ago, as it may be
@@ -50,9 +50,7 @@ def gathered(offsets: dict[str, float], rig: ClockRig | None = None) -> Clocks:
         ),
     ],
 )
-def test_clocks_that_depart_are_shifted(
-    offsets: dict[str, float], shifts: dict[str, float], said: str
-) -> None:
+def test_clocks_that_depart_are_shifted(offsets, shifts, said):
     correction = gathered(offsets).correction()
     assert correction.shifts.keys() == shifts.keys()
     for topic, shift in shifts.items():
@@ -67,12 +65,12 @@ def test_clocks_that_depart_are_shifted(
     assert unstamped / SECOND == pytest.approx(7.0 + typical * (abs(typical) > 1.0), abs=0.02)
 
 
-def test_the_logs_times_count_for_all_if_told_so() -> None:
+def test_the_logs_times_count_for_all_if_told_so():
     correction = gathered({"/a": 90.0, "/b": 0.0}, ClockRig(stamp="log")).correction()
     assert correction.time(received("/a", 3.0, 93.0)) == BEGIN + 3 * SECOND
 
 
-def test_messages_come_in_the_order_of_their_times_if_they_are_not_too_late() -> None:
+def test_messages_come_in_the_order_of_their_times_if_they_are_not_too_late():
     stamps = [3, 1, 2, 9, 5, 4, 30, 0]  # the last one comes long after its place
     logged = [0, 0, 0, 1, 1, 1, 3 * SLACK, 3 * SLACK]
     messages = [Received("/t", *times, "") for times in zip(logged, stamps, strict=True)]

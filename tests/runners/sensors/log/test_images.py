@@ -16,7 +16,7 @@ VALUES = np.random.default_rng(0).integers(0, 2**16, (4, 7)).astype(np.uint16)
 @pytest.mark.parametrize("big_endian", [False, True])
 @pytest.mark.parametrize(("encoding", "kind"), [("16UC1", "u2"), ("mono16", "u2"), ("32FC1", "f4")])
 @pytest.mark.parametrize("padding", [0, 3])
-def test_rows_of_pixels(encoding: str, kind: str, big_endian: bool, padding: int) -> None:
+def test_rows_of_pixels(encoding, kind, big_endian, padding):
     stored = VALUES.astype((">" if big_endian else "<") + kind)
     rows = np.pad(stored.view(np.uint8).reshape(4, -1), ((0, 0), (0, padding)))
     found = pixel_rows(rows.tobytes(), encoding, (7, 4), rows.shape[1], big_endian=big_endian)
@@ -38,12 +38,12 @@ def test_rows_of_pixels(encoding: str, kind: str, big_endian: bool, padding: int
         (b"short", "16UC1; compressedDepth", "is no PNG"),
     ],
 )
-def test_what_is_no_depth_is_refused(data: bytes, text: str, reason: str) -> None:
+def test_what_is_no_depth_is_refused(data, text, reason):
     with pytest.raises(UnusableMessage, match=reason):
         compressed_pixels(data, text)
 
 
-def test_compressed_depth_is_that_of_image_transport() -> None:
+def test_compressed_depth_is_that_of_image_transport():
     np.testing.assert_array_equal(compressed_pixels(png(VALUES), "png"), VALUES)
     whole = struct.pack("<iff", 0, 0.0, 0.0) + png(VALUES)
     np.testing.assert_array_equal(compressed_pixels(whole, "16UC1; compressedDepth png"), VALUES)
@@ -57,7 +57,7 @@ def test_compressed_depth_is_that_of_image_transport() -> None:
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_points_of_several_rows_with_gaps(order: str) -> None:
+def test_points_of_several_rows_with_gaps(order):
     points = np.random.default_rng(1).normal(size=(2, 3, 3))
     points[..., 1] = points[..., 1].astype(np.float32)
     kinds = [order + kind for kind in ("f8", "f4", "f8")]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from runners.sensors.log.messages import (
     CloudMessage,
     Content,
     ImageMessage,
-    Received,
     TransformMessage,
     WrenchMessage,
 )
@@ -37,7 +35,7 @@ from tests.runners.sensors.small_logs import (
 TURNED = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])
 
 
-def moved(x: float, y: float, z: float) -> np.ndarray:
+def moved(x, y, z):
     pose = np.eye(4)
     pose[:3, 3] = x, y, z
     return pose
@@ -63,7 +61,7 @@ CONTENTS: dict[str, Content] = {  # of step 3
 ROS2_ALONE = {"/quantised", "/wrench", "/touch", "/count"}
 
 
-def by_topic(path: Path) -> dict[str, Received]:
+def by_topic(path):
     """The last message of each topic."""
     log = RawLog(path)
     received = {one.topic: one for one in log.messages(log.topics)}
@@ -72,7 +70,7 @@ def by_topic(path: Path) -> dict[str, Received]:
     return received
 
 
-def assert_same(found: Content, expected: Content) -> None:
+def assert_same(found, expected):
     assert type(found) is type(expected)
     if isinstance(expected, str | dict | CameraInfoMessage):
         assert found == expected
@@ -87,7 +85,7 @@ def assert_same(found: Content, expected: Content) -> None:
 
 
 @pytest.mark.parametrize("foxglove", ["", "packed", "rows"])
-def test_messages_of_both_encodings_are_decoded(tmp_path: Path, foxglove: str) -> None:
+def test_messages_of_both_encodings_are_decoded(tmp_path, foxglove):
     path, topics = tmp_path / "log.mcap", CONTENTS.keys()
     write_ros2(path, ros2_sent(4))
     if foxglove:
@@ -101,7 +99,7 @@ def test_messages_of_both_encodings_are_decoded(tmp_path: Path, foxglove: str) -
     assert found["/probe"].stamp is None
 
 
-def test_broken_messages_are_counted_with_their_topic(tmp_path: Path) -> None:
+def test_broken_messages_are_counted_with_their_topic(tmp_path):
     good = ros2_sent(1)
     ages_ago = {"stamp": {"sec": -1, "nanosec": 0}, "frame_id": "a"}
     images = [{"encoding": "rgb8"}, {"height": 2**31}, {"header": ages_ago}]
@@ -124,7 +122,7 @@ def test_broken_messages_are_counted_with_their_topic(tmp_path: Path) -> None:
     assert "a force or torque is not finite" in said
 
 
-def test_unknown_schemas_and_fields_are_faults(tmp_path: Path) -> None:
+def test_unknown_schemas_and_fields_are_faults(tmp_path):
     data = b"\0\1\0\0\4\0\0\0end\0"
     with (tmp_path / "log.mcap").open("wb") as file:
         writer = McapWriter(file)
@@ -147,7 +145,7 @@ def test_unknown_schemas_and_fields_are_faults(tmp_path: Path) -> None:
     assert len(reasons) == 3
 
 
-def test_messages_with_further_fields_are_read(tmp_path: Path) -> None:
+def test_messages_with_further_fields_are_read(tmp_path):
     text = full_definition("sensor_msgs/JointState")
     own, _, parts = text.partition("=")
     own = f"# A comment; with uint8 in it\nint32 MOST=7\nuint16 sequence\n{own}Own[] more\n"
@@ -163,7 +161,7 @@ def test_messages_with_further_fields_are_read(tmp_path: Path) -> None:
     assert (received.stamp, received.log_time) == (None, BEGIN)  # a stamp of 0 is none
 
 
-def test_intrinsics_are_those_of_the_pixels_that_are_sent(tmp_path: Path) -> None:
+def test_intrinsics_are_those_of_the_pixels_that_are_sent(tmp_path):
     topic, kind, message, log_time = next(one for one in ros2_sent(1) if one[0] == "/info")
     sent = {
         **message,

@@ -1,14 +1,12 @@
 """Which time belongs to which probe."""
 
-from __future__ import annotations
-
 import pytest
 
 from runners.sensors.log.probe_windows import marked_windows
 from runners.sensors.session_report import LogWarnings
 
 
-def spans(*texts: str) -> tuple[list[tuple[int, int, int, int, int]], list[str]]:
+def spans(*texts):
     """Windows of markers at times 10, 20, ... in a log from 0 to 100, and the warnings."""
     warnings = LogWarnings()
     markers = [(10 * (index + 1), text) for index, text in enumerate(texts)]
@@ -17,7 +15,7 @@ def spans(*texts: str) -> tuple[list[tuple[int, int, int, int, int]], list[str]]
     return found, [text for _, text in warnings.lines()]
 
 
-def test_a_window_reaches_to_the_next_begin_and_the_first_one_to_the_start() -> None:
+def test_a_window_reaches_to_the_next_begin_and_the_first_one_to_the_start():
     found, said = spans("begin 0", "end 0", " Begin 1", "END 1")
     assert found == [(0, 0, 10, 20, 30), (1, 30, 30, 40, 101)]
     assert said == []
@@ -31,16 +29,14 @@ def test_a_window_reaches_to_the_next_begin_and_the_first_one_to_the_start() -> 
         (("0", "0", "1", "-5"), [0, 1]),  # a change of number ends a probe
     ],
 )
-def test_states_that_are_sent_all_the_time_say_nothing_new(
-    texts: tuple[str, ...], steps: list[int]
-) -> None:
+def test_states_that_are_sent_all_the_time_say_nothing_new(texts, steps):
     found, said = spans(*texts)
     assert ([step for step, *_ in found], said) == (steps, [])
     if steps[1] == 1 and texts[0] == "0":
         assert found == [(0, 0, 10, 30, 30), (1, 30, 30, 40, 101)]
 
 
-def test_marks_that_do_not_fit_are_reported() -> None:
+def test_marks_that_do_not_fit_are_reported():
     found, said = spans("end 9", "begin 2", "hello", "begin 2", "begin 1")
     assert found == [(0, 0, 20, 50, 50), (1, 50, 50, 100, 101)]
     assert said == [

@@ -2,7 +2,6 @@
 
 import hashlib
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from runners.simulated_robot.log_writer import image
 from tests.runners.sensors.small_logs import BEGIN, ros2_sent, write_ros2
 
 
-def texts(path: Path) -> list[str]:
+def texts(path):
     """Messages as text that can be compared."""
     log = RawLog(path)
     return [repr(one) for one in log.messages(log.topics)]
@@ -23,9 +22,7 @@ def texts(path: Path) -> list[str]:
 
 @pytest.mark.parametrize("compression", list(CompressionType))
 @pytest.mark.parametrize("finished", [True, False])
-def test_files_of_all_kinds_give_the_same(
-    tmp_path: Path, compression: CompressionType, finished: bool
-) -> None:
+def test_files_of_all_kinds_give_the_same(tmp_path, compression, finished):
     """finished: else as a recorder that was killed leaves it."""
     usual, path = tmp_path / "usual.mcap", tmp_path / "log.mcap"
     write_ros2(usual, ros2_sent(3))
@@ -38,7 +35,7 @@ def test_files_of_all_kinds_give_the_same(
     assert bool(log.warnings) == (not finished)
 
 
-def test_messages_come_in_order_of_log_time(tmp_path: Path) -> None:
+def test_messages_come_in_order_of_log_time(tmp_path):
     sent = ros2_sent(6)
     mixed = [sent[i] for i in np.random.default_rng(0).permutation(len(sent))]
     write_ros2(tmp_path / "log.mcap", mixed, chunk_size=300)
@@ -52,7 +49,7 @@ def test_messages_come_in_order_of_log_time(tmp_path: Path) -> None:
         log.messages(["/a"])
 
 
-def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_the_log(tmp_path):
     noise = np.random.default_rng(0).integers(0, 2**16, (64, 128)).astype(np.uint16)
     sent = [
         ("/depth", "sensor_msgs/Image", image("a", noise, BEGIN + n), BEGIN + n) for n in range(500)
@@ -80,16 +77,14 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
         ("", None, r"without \.mcap files; accepted.*`ros2 bag convert`"),
     ],
 )
-def test_what_is_no_log_is_an_error(
-    tmp_path: Path, name: str, content: bytes | None, message: str
-) -> None:
+def test_what_is_no_log_is_an_error(tmp_path, name, content, message):
     if content is not None:
         (tmp_path / name).write_bytes(content)
     with pytest.raises(SessionError, match=message):
         RawLog(tmp_path / name)
 
 
-def test_a_cut_file_gives_what_is_before_the_cut(tmp_path: Path) -> None:
+def test_a_cut_file_gives_what_is_before_the_cut(tmp_path):
     data = write_ros2(tmp_path / "log.mcap", ros2_sent(8), chunk_size=1500)
     whole = texts(tmp_path / "log.mcap")
     (tmp_path / "log.mcap").write_bytes(data[: len(data) // 4])
@@ -106,9 +101,7 @@ def test_a_cut_file_gives_what_is_before_the_cut(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("by_topic", [False, True])
 @pytest.mark.parametrize("finished", [True, False])
-def test_a_folder_is_one_log_in_order_of_time(
-    tmp_path: Path, by_topic: bool, finished: bool
-) -> None:
+def test_a_folder_is_one_log_in_order_of_time(tmp_path, by_topic, finished):
     """by_topic: a file holds one; else the log is split by time, into eleven files."""
     sent = [(*one[:3], one[3] + n) for n, one in enumerate(ros2_sent(11))]
     topics = list(dict.fromkeys(one[0] for one in sent))

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import axis_angle, compose, inverse, random_rotations, rotation_angle
 from runners.sensors.log.clocks import ClockCorrection
 from runners.sensors.log.decoding import rigid
@@ -21,11 +20,11 @@ SECOND = 10**9
 X, Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
-def pose(x: float = 0.0, angle: float = 0.0, axis: FloatArray = Z) -> FloatArray:
+def pose(x=0.0, angle=0.0, axis=Z):
     return compose(axis_angle(axis, angle), np.array([x, 0.0, 0.0]))
 
 
-def tree(*transforms: tuple[float, str, str, FloatArray], static: bool = False) -> TransformTree:
+def tree(*transforms, static=False):
     """Transforms at seconds."""
     made = TransformTree()
     for seconds, *parts in transforms:
@@ -35,7 +34,7 @@ def tree(*transforms: tuple[float, str, str, FloatArray], static: bool = False) 
     return made
 
 
-def test_between_samples_it_goes_straight_and_along_the_shorter_arc() -> None:
+def test_between_samples_it_goes_straight_and_along_the_shorter_arc():
     start, end = 3.0, 3.0 - 2 * np.pi + 0.5  # 0.5 rad further, the long way round as numbers
     moving = tree((1, "a", "b", pose(0.0, start)), (2, "a", "b", pose(1.0, end)))
     for time, x, angle in ((1.0, 0.0, 3.0), (1.5, 0.5, 3.25), (1.9, 0.9, 3.45), (2.0, 1.0, 3.5)):
@@ -50,7 +49,7 @@ def test_between_samples_it_goes_straight_and_along_the_shorter_arc() -> None:
     np.testing.assert_allclose(rotation_angle(first.T @ found[:3, :3]), expected, atol=1e-12)
 
 
-def test_a_chain_joins_static_and_moving_frames_over_their_common_root() -> None:
+def test_a_chain_joins_static_and_moving_frames_over_their_common_root():
     camera, turned = pose(0.5, 0.3, X), pose(1.0, np.pi / 2)
     made = tree(
         *((time, "world", "arm", turned) for time in (0, 1)),
@@ -64,7 +63,7 @@ def test_a_chain_joins_static_and_moving_frames_over_their_common_root() -> None
     np.testing.assert_array_equal(made.lookup("arm", "arm", 5, gap_s=1.0), np.eye(4))
 
 
-def test_order_and_repetition_do_not_matter() -> None:
+def test_order_and_repetition_do_not_matter():
     random = np.random.default_rng(0)
     samples = [(i / 10, "a", "b", pose(random.normal(), 3 * random.normal())) for i in range(30)]
     mixed = [samples[i] for i in random.permutation(30)] + samples[5:9]
@@ -75,7 +74,7 @@ def test_order_and_repetition_do_not_matter() -> None:
     np.testing.assert_array_equal(found, expected)
 
 
-def test_stamps_of_a_clock_that_is_ahead_are_put_right() -> None:
+def test_stamps_of_a_clock_that_is_ahead_are_put_right():
     made, ahead = TransformTree(), 90 * SECOND
     for time in (SECOND, 2 * SECOND):
         for topic, child, stamp in (("/tf", "b", time + ahead), ("/arm", "c", time)):
@@ -87,7 +86,7 @@ def test_stamps_of_a_clock_that_is_ahead_are_put_right() -> None:
     np.testing.assert_allclose(found, pose(0.0), atol=1e-12)
 
 
-def test_gaps_and_ends_are_bridged_as_far_as_told() -> None:
+def test_gaps_and_ends_are_bridged_as_far_as_told():
     made = tree(*((time, "a", "b", pose(time)) for time in (1.0, 1.4, 3.0)))
     times = np.array([0.4, 0.6, 1.2, 1.4, 1.5, 2.9, 3.0, 3.5, 3.6])
     stamps = (times * SECOND).astype(np.int64)
@@ -101,7 +100,7 @@ def test_gaps_and_ends_are_bridged_as_far_as_told() -> None:
         made.lookup("a", "b", 4 * SECOND, gap_s=0.5)
 
 
-def test_what_is_missing_is_said() -> None:
+def test_what_is_missing_is_said():
     made = tree((0, "world", "arm", pose()), (0, "map", "camera", pose()))
     with pytest.raises(TransformError, match="frame wrist is in no transform; there are arm, cam"):
         made.lookup("world", "wrist", 0, gap_s=1.0)
@@ -112,7 +111,7 @@ def test_what_is_missing_is_said() -> None:
         TransformTree().lookup("a", "b", 0, gap_s=1.0)
 
 
-def test_contradictions_are_faults() -> None:
+def test_contradictions_are_faults():
     """Of parents the first counts, of static places the latest."""
     made = tree(
         (0, "a", "b", pose(1.0)),
@@ -133,7 +132,7 @@ def test_contradictions_are_faults() -> None:
     assert made.faults == {"frame b is static in several places": 2}
 
 
-def test_quaternions_of_any_length_are_rotations() -> None:
+def test_quaternions_of_any_length_are_rotations():
     for angle in (0.0, 1.2, np.pi):
         for axis in np.eye(3):
             x, y, z = np.sin(angle / 2) * 1e300 * axis
@@ -142,7 +141,7 @@ def test_quaternions_of_any_length_are_rotations() -> None:
             np.testing.assert_allclose(found, pose(1.0, angle, axis), atol=1e-14)
 
 
-def history(*positions: dict[str, float]) -> JointHistory:
+def history(*positions):
     """Positions at times 0, 10, 20, ..."""
     joints = JointHistory(["finger"])
     for index, values in enumerate(positions):
@@ -151,7 +150,7 @@ def history(*positions: dict[str, float]) -> JointHistory:
     return joints
 
 
-def test_a_state_of_the_joints_holds_until_the_next() -> None:
+def test_a_state_of_the_joints_holds_until_the_next():
     moved = [0.1 if time >= 500 else 0.001 * (time % 20) for time in range(0, 1000, 10)]
     joints = history(*({"finger": value, "elbow": 10.0 * n} for n, value in enumerate(moved)))
     assert joints.first() == {"finger": 0.0}
