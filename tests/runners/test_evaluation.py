@@ -1,4 +1,4 @@
-"""The tasks of an evaluation: their failures, external results, iterations."""
+"""The tasks of an evaluation, and its folder."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 from distributed import Client
+from filelock import FileLock, Timeout
 
 from chsel.errors import ChselError, SettingError
 from chsel.methods.icp import Icp
@@ -29,7 +30,7 @@ from replay.comparing.verification import EQUAL, NO_RESULT, verify
 from replay.mcap.reader import read_recording
 from runners.evaluation import tasks
 from runners.evaluation.contenders import Contender, chosen_contenders
-from runners.evaluation.experiment import collect, join_experiment
+from runners.evaluation.experiment import collect, join_experiment, writing_alone
 from runners.evaluation.metrics import MetricsConfig
 from runners.evaluation.plan import OWN, Plan, Task, Trial
 from runners.evaluation.run_method import ResultRows, read_external
@@ -351,3 +352,17 @@ def test_a_session_with_faults_is_measured_by_the_plausible_sets_of_that_without
     assert (
         rows.row(recording.problem(5), exact)["exact_members"] == 1.0
     )  # by contacts without noise
+
+
+def test_a_second_run_in_a_folder_waits_for_the_first(tmp_path):
+    lock, said = FileLock(tmp_path / ".lock"), list[str]()
+    lock.acquire()
+
+    def end_the_first(line):
+        said.append(line)
+        lock.release()
+
+    with writing_alone(tmp_path, end_the_first):
+        assert said == [f"another run is at work in {tmp_path}; this one waits until it ends"]
+        with pytest.raises(Timeout):
+            lock.acquire(timeout=0)

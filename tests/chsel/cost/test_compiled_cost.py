@@ -20,8 +20,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.problem.poses import Poses, compose, random_rotations
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
-from tests.chsel.problem.torch_spaces import decode
-from tests.chsel.samples import ball_grid, random_poses
+from tests.chsel.samples import ball_grid, decode, random_poses
 
 pytestmark = pytest.mark.filterwarnings("ignore:free_term interior uses")
 BOX_SIDES = (0.12, 0.08, 0.06)

@@ -9,8 +9,7 @@ from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.objective import Objective
 from chsel.problem.poses import Poses
 from chsel.problem.search_space import SE3Space
-from tests.chsel.problem.torch_spaces import decode
-from tests.chsel.samples import ball_grid, random_poses
+from tests.chsel.samples import ball_grid, decode, random_poses
 
 RADIUS = 0.1
 SPHERE = ball_grid(RADIUS, 0.01, 25)  # whose nodes hold the points of the closed forms

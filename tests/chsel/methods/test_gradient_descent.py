@@ -17,8 +17,7 @@ from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
 from tests.chsel.methods.scene import Watcher
-from tests.chsel.problem.torch_spaces import decode
-from tests.chsel.samples import random_poses
+from tests.chsel.samples import decode, random_poses
 
 SIDES = np.array([0.12, 0.08, 0.06])
 BOX = SdfGrid.from_mesh(trimesh.creation.box(SIDES), 0.01)

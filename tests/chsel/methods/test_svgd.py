@@ -23,7 +23,7 @@ from tests.chsel.methods.scene import (
     around_truth,
     contacts_on,
 )
-from tests.chsel.problem.torch_spaces import decode
+from tests.chsel.samples import decode
 
 CONTACTS = contacts_on(BOX, 15)
 ADAM = {"lr": 0.005, "betas": (0.9, 0.999), "eps": 1e-8}

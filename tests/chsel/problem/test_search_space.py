@@ -24,8 +24,7 @@ from chsel.problem.poses import (
 )
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space
 from chsel.qd.measures import MEASURES, measure_named
-from tests.chsel.problem.torch_spaces import decode
-from tests.chsel.samples import random_poses
+from tests.chsel.samples import decode, random_poses
 
 SIDES = (0.2, 0.1, 0.06)
 BOX = SdfGrid.from_mesh(trimesh.creation.box(SIDES), 0.01)

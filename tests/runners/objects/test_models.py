@@ -1,7 +1,11 @@
-"""Our models against the table of the scans, and against the scans where they are at hand."""
+"""Models of objects, and scans."""
 
 from __future__ import annotations
 
+import io
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import igl
@@ -10,6 +14,7 @@ import pytest
 import trimesh
 
 from runners.objects.loader import MODELS, load_model
+from runners.objects.scans import AssetsConfig, DownloadError, download_scan
 
 
 class Scan(NamedTuple):
@@ -71,3 +76,76 @@ def test_a_model_lies_close_to_its_scan(name, ycb_directory):
     assert model.volume == pytest.approx(scan.volume, rel=0.03)
     mean_distance = (_distances(model, scan).mean() + _distances(scan, model).mean()) / 2
     assert mean_distance < 1e-3
+
+
+SCAN = "012_strawberry"
+
+
+def archive(mesh, scan=SCAN):
+    ply = mesh.export(file_type="ply")
+    stream = io.BytesIO()
+    with tarfile.open(fileobj=stream, mode="w:gz") as tar:
+        for name, content in (
+            (f"{scan}/google_16k/kinbody.xml", b"<x/>"),
+            (f"./{scan}/google_16k/nontextured.ply", ply),
+            ("../escaped", b"x"),
+        ):
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            tar.addfile(info, io.BytesIO(content))
+    return stream.getvalue()
+
+
+def open_box():
+    mesh = trimesh.creation.box((0.1, 0.2, 0.3))
+    mesh.update_faces(np.arange(12) > 0)
+    return mesh
+
+
+BOX = archive(trimesh.creation.box((0.1, 0.2, 0.3)))
+Serve = Callable[[bytes], AssetsConfig]
+
+
+@pytest.fixture
+def serve(monkeypatch, tmp_path):
+    """Hands some bytes out as the archive of any scan."""
+
+    def hold(content):
+        def retrieve(url, known_hash, path, downloader):
+            (Path(path) / "archive").write_bytes(content)
+            return str(Path(path) / "archive")
+
+        monkeypatch.setattr("pooch.retrieve", retrieve)
+        return AssetsConfig(str(tmp_path / "assets"), "http://host")
+
+    return hold
+
+
+def test_the_mesh_is_placed_as_in_the_official_archive_and_nothing_else(serve):
+    assets = serve(BOX)
+    assert download_scan(SCAN, assets) == "8 vertices, 100.0 x 200.0 x 300.0 mm"
+    files = [path for path in assets.folder.parent.rglob("*") if path.is_file()]
+    assert files == [assets.folder / SCAN / "google_16k" / "nontextured.ply"]
+
+
+@pytest.mark.filterwarnings("ignore:mesh file")  # the open one
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (archive(open_box()), "its mesh is not watertight"),
+        (archive(trimesh.creation.box(), scan="other"), "does not exist"),
+        (b"<html>", "not a gzip file"),
+        (BOX[:-200], "Compressed file ended"),
+    ],
+    ids=["open", "another", "a page", "cut"],
+)
+def test_what_is_not_the_scan_leaves_nothing(serve, content, reason):
+    assets = serve(content)
+    with pytest.raises(DownloadError, match=rf"_google_16k\.tgz is not the archive .*{reason}"):
+        download_scan(SCAN, assets)
+    assert list(assets.folder.iterdir()) == []
+
+
+def test_no_server_at_all_is_reported(tmp_path):
+    with pytest.raises(DownloadError, match=r"refused.*; try again"):
+        download_scan(SCAN, AssetsConfig(str(tmp_path), "http://127.0.0.1:1"))

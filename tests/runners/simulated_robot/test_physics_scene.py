@@ -1,4 +1,4 @@
-"""Objects in the cabinet; the engine's depth images and contacts against exact geometry."""
+"""The simulated robot's world: scene, membranes and noise."""
 
 import sys
 from contextlib import closing
@@ -9,9 +9,26 @@ import trimesh
 
 from chsel.errors import SessionError
 from chsel.problem.poses import apply
+from chsel.problem.streams import Purpose, StreamKey
 from runners.objects.loader import load_model
 from runners.simulated_robot import cabinet
-from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS, REST, SHELF, stood_on_shelf
+from runners.simulated_robot.cabinet import (
+    CABINET_CONFIGURATIONS,
+    CAP,
+    CAP_BASE,
+    REST,
+    SHELF,
+    stood_on_shelf,
+)
+from runners.simulated_robot.noise import (
+    BASELINE,
+    BUBBLE_NOISE,
+    LOST,
+    NOISE,
+    bubble_depth,
+    stereo_depth,
+)
+from runners.simulated_robot.pads import TAUTNESS, Membrane
 from runners.simulated_robot.physics_scene import NEAR, PhysicsScene
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings
 
@@ -93,3 +110,120 @@ def test_a_missing_engine_is_said(monkeypatch):
     monkeypatch.setitem(sys.modules, "pybullet", None)
     with pytest.raises(SessionError, match="PyBullet is not installed"):
         PhysicsScene(MESH, POSE)
+
+
+CAMERA = BubbleSettings().pinhole
+APEX = CAP_BASE + CAP[2]
+
+
+@pytest.fixture(scope="module")
+def membrane():
+    return Membrane(CAMERA)
+
+
+def test_the_untouched_membrane_is_half_an_ellipsoid(membrane):
+    x, y = CAMERA.directions()[..., :2].transpose(2, 0, 1)
+    points = np.stack([x * membrane.rest, y * membrane.rest, membrane.rest - CAP_BASE], axis=-1)
+    soft = membrane.rest > CAP_BASE
+    assert np.allclose(((points[soft] / CAP) ** 2).sum(axis=-1), 1.0, atol=1e-12)
+    assert membrane.rest.max() == pytest.approx(APEX, abs=1e-6)
+    beside = points[~soft]
+    assert (((beside[:, :2] / CAP[:2]) ** 2).sum(axis=-1) >= 1.0 - 1e-12).all()
+    assert 0.7 < soft.mean() < 0.8  # an ellipse in its rectangle: pi / 4
+
+
+def test_a_plane_flattens_what_it_reaches(membrane):
+    plane = APEX - 0.005
+    depth = membrane.pressed(np.full(membrane.rest.shape, plane))
+    reached = membrane.rest > plane
+    deep = membrane.rest > plane + 0.002
+    assert np.allclose(depth[deep], plane, atol=1e-12)
+    # Where a taut sheet leaves a plane it does so without a kink, a little before the plane does.
+    assert (depth[reached] <= plane + 1e-12).all()
+    assert (depth[reached] > plane - 0.001).all()
+    assert (depth <= membrane.rest).all()
+    assert (depth[~reached] < membrane.rest[~reached]).any()
+
+
+def test_no_object_goes_through_the_base(membrane):
+    depth = membrane.pressed(np.full(membrane.rest.shape, 0.02))
+    assert (depth >= np.minimum(membrane.rest, CAP_BASE)).all()
+    assert (depth[membrane.rest <= CAP_BASE] == CAP_BASE).all()
+
+
+@pytest.mark.parametrize("width", [224, 112])
+def test_beside_a_straight_edge_the_dent_falls_as_that_of_a_taut_sheet(width):
+    camera = BubbleSettings(width=width).pinhole
+    wide = Membrane(camera)
+    beyond = np.full(wide.rest.shape, 1.0)
+    beyond[:, : width // 2] = wide.rest[:, : width // 2] - 0.004
+    dent = (wide.rest - wide.pressed(beyond))[camera.height // 2]
+    pitch = APEX / camera.fx
+    away = round(TAUTNESS / pitch)
+    edge = width // 2 - 1
+    assert dent[edge] == pytest.approx(0.004, abs=1e-12)
+    expected = 0.004 * np.exp(-away * pitch / TAUTNESS)
+    assert dent[edge + away] == pytest.approx(expected, rel=0.05)
+
+
+PINHOLE = CameraSettings(width=320).pinhole
+CLOSE, FAR = 0.5, 0.9
+LEFT, RIGHT = 120, 200  # columns of a bar before a wall
+
+
+def stream(index=0):
+    return StreamKey(7, 0).stream(Purpose.SENSOR_NOISE, index)
+
+
+@pytest.fixture(scope="module")
+def bar():
+    """True depths of a bar before a wall, metres, and measured ones, millimetres."""
+    depth = np.full((PINHOLE.height, PINHOLE.width), FAR)
+    depth[:, LEFT:RIGHT] = CLOSE
+    return depth, stereo_depth(depth, PINHOLE, stream())
+
+
+@pytest.mark.parametrize("distance", [0.5, 1.0, 2.0])
+def test_noise_away_from_edges_grows_with_the_depth_squared(distance):
+    measured = stereo_depth(np.full((PINHOLE.height, PINHOLE.width), distance), PINHOLE, stream())
+    assert measured.dtype == np.uint16
+    error = measured[measured > 0] / 1000.0 - distance
+    expected = np.sqrt((NOISE * distance**2) ** 2 + 0.001**2 / 12.0)  # and rounding
+    assert error.std() == pytest.approx(expected, rel=0.02)
+    assert abs(error.mean()) < 1e-4
+    assert (measured == 0).mean() == pytest.approx(LOST, rel=0.2)
+
+
+def test_edges_are_where_the_camera_is_worst(bar):
+    depth, measured = bar
+    wrong = (measured > 0) & (np.abs(measured / 1000.0 - depth) > 0.05)
+    columns = np.arange(PINHOLE.width)
+    band = (np.abs(columns - LEFT) < 3) | (np.abs(columns - RIGHT) < 3)
+    far_off = (np.abs(columns - LEFT) > 40) & (np.abs(columns - RIGHT) > 40)
+    assert wrong[:, band].mean() > 0.1
+    assert (measured[:, band] == 0).mean() > 0.2
+    assert wrong[:, far_off].mean() == 0.0
+    assert (measured[:, far_off] == 0).mean() < 0.01
+    # Some pixels at edges float between both sides.
+    between = (measured > 1000 * (CLOSE + 0.05)) & (measured < 1000 * (FAR - 0.05))
+    assert between.sum() > PINHOLE.height / 4
+    assert not between[:, (np.abs(columns - LEFT) >= 12) & (np.abs(columns - RIGHT) >= 12)].any()
+
+
+def test_the_shadow_of_the_second_eye_is_as_wide_as_geometry_says(bar):
+    _, measured = bar
+    width = PINHOLE.fx * BASELINE * (1.0 / CLOSE - 1.0 / FAR)
+    lost = (measured == 0).mean(axis=0)
+    inside = lost[round(LEFT - width) + 3 : LEFT - 3]
+    assert (inside > 0.6).all()
+    assert lost[round(LEFT - width) - 8] < 0.1
+    assert lost[RIGHT + 8] < 0.1  # only on the left, as the second eye is on the right
+
+
+def test_a_bubble_camera_is_noisy_by_what_it_says():
+    measured = bubble_depth(np.full((171, 224), 0.07), stream())
+    assert measured.dtype == np.float32
+    good = measured[measured > 0]
+    assert good.std() == pytest.approx(np.sqrt(BUBBLE_NOISE**2 + 0.0001**2 / 12), rel=0.02)
+    assert good.mean() == pytest.approx(0.07, abs=1e-5)
+    assert 0 < (measured == 0).sum() < 0.003 * measured.size

@@ -1,0 +1,228 @@
+"""The stages of anchored: modes, walks and fits."""
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.optimize import minimize
+
+from chsel.methods.anchored.fitting import fitted, twists_of
+from chsel.methods.anchored.modes import FAR, distinct, has_new_mode, near_symmetries
+from chsel.methods.anchored.walking import stride_of, walked
+from chsel.problem.noise import LEVELS, NoiseModel, noise_model
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, rotation_angle
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.search_space import PlaneSettings, SE3Space, origin_bounds, search_space
+from chsel.problem.streams import Purpose, StreamKey
+from chsel.problem.surface import object_centre
+from tests.chsel.methods.scene import (
+    BOX,
+    BOX_GRID,
+    BOX_SIDES,
+    GRID,
+    STANDING,
+    TRUTH,
+    WORKSPACE,
+    contacts_on,
+    energy_of,
+    on_faces,
+    poses_around_truth,
+)
+from tests.chsel.samples import plain_energies
+
+
+def turned(angle, shift=0.0):
+    """world_from_object: TRUTH after a turn about the box's x axis, and a shift along it."""
+    turn = axis_angle(np.array([1.0, 0.0, 0.0]), np.array(angle))
+    return np.asarray(TRUTH @ compose(turn, np.array([shift, 0.0, 0.0])))
+
+
+def poses_of(*world_from_object):
+    return Poses.of(inverse(np.array(world_from_object)))
+
+
+def test_distinct_poses_are_apart_in_surface_or_turn():
+    """A half turn of a box leaves its surface where it was."""
+    some = [turned(0.0), turned(0.02), turned(math.pi), turned(math.pi, 0.002), turned(0.0, 0.06)]
+    some += [turned(0.0, 0.061)]
+    assert distinct(BOX_GRID, poses_of(*some), 9).tolist() == [0, 2, 4]
+    assert distinct(BOX_GRID, poses_of(*some[::-1]), 9).tolist() == [0, 2, 4]
+    assert distinct(BOX_GRID, poses_of(*some), 2).tolist() == [0, 2]
+    assert distinct(BOX_GRID, poses_of(*some), 9, np.inf).tolist() == [0, 2]  # by turns alone
+
+
+def test_a_new_mode_is_farther_than_the_old_ones_are_from_each_other():
+    near, far = [turned(0.0, 0.001 * n) for n in range(5)], [turned(0.0, 0.1)]
+    assert not has_new_mode(BOX_GRID, poses_of(*near[:2]), poses_of(*near[2:]), 30)
+    assert has_new_mode(BOX_GRID, poses_of(*near), poses_of(near[0], *far), 30)
+    spread = poses_of(*(turned(0.0, 8.0 * FAR * n) for n in range(4)))
+    between = poses_of(turned(0.0, 12.0 * FAR))
+    assert not has_new_mode(BOX_GRID, spread, between, 4)
+    none = Poses(np.zeros((0, 12)))
+    assert has_new_mode(BOX_GRID, none, spread, 30)
+    assert not has_new_mode(BOX_GRID, spread, none, 30)
+
+
+@pytest.mark.parametrize(
+    ("sides", "halves", "quarters"),
+    [((0.1, 0.06, 0.16), 3, 0), ((0.1, 0.102, 0.16), 5, 2)],
+)
+def test_near_symmetries_of_a_box(sides, halves, quarters):
+    """Of two sides 2 mm apart also half turns about their diagonals, and quarter turns."""
+    sdf = SdfGrid.from_mesh(trimesh.creation.box(sides), 0.005)
+    found = near_symmetries(sdf)
+    angles = rotation_angle(found[:, :3, :3])
+    assert (np.abs(angles - np.pi) < 0.02).sum() == halves
+    assert (np.abs(angles - 0.5 * np.pi) < 0.02).sum() == quarters
+    assert len(found) == halves + quarters
+    np.testing.assert_allclose(np.sort(np.abs(found[:, :3, :3]), axis=2)[..., :2], 0.0, atol=0.02)
+    np.testing.assert_allclose(found[:, :3, 3], 0.0, atol=0.001)
+    assert near_symmetries(sdf) is found
+
+
+def test_an_object_without_symmetry_has_none():
+    assert near_symmetries(GRID).shape == (0, 4, 4)
+    nowhere = SdfGrid(GRID.origin, 0.01, np.abs(GRID.values) + 0.01, GRID.gradients)
+    assert near_symmetries(nowhere).shape == (0, 4, 4)
+
+
+PLANE = PlaneSettings(plane_height=0.3 - 0.5 * BOX_SIDES[2])  # on which the box is at STANDING
+NORMAL = NoiseModel((0.001,) * LEVELS, (1.0 / LEVELS,) * LEVELS)
+AROUND = KnownPoints(
+    known=apply(TRUTH, on_faces(24)),
+    free=apply(TRUTH, on_faces(60, 0.004)),
+    occupied=apply(TRUTH, on_faces(6, -0.002)),
+)
+
+
+def chains_of(energy, poses, floor, moves, kept=0, plane=None):
+    space, stream = search_space(plane, BOX_GRID), StreamKey(5, 2).kernel_stream(Purpose.WALKS, 3)
+    stride = stride_of(space, object_centre(BOX_GRID), origin_bounds(WORKSPACE, space, 0.15))
+    return walked(energy, stride, poses, energy.of(poses), floor, moves, stream, kept)
+
+
+def repeated(world_from_object, count):
+    return Poses.of(np.tile(inverse(world_from_object), (count, 1, 1)))
+
+
+@pytest.mark.parametrize(("plane", "dimension", "contacts"), [(None, 6, 60), (PLANE, 3, 24)])
+def test_kept_states_are_drawn_from_the_likelihood(plane, dimension, contacts):
+    """Of a normal distribution in d dimensions, energies are d / 2 above the least on average."""
+    truth = TRUTH if plane is None else STANDING
+    energy = energy_of(KnownPoints(known=apply(truth, on_faces(contacts))), NORMAL)
+    chains = chains_of(energy, repeated(truth, 100), 50.0, 1500, 15, plane)
+    above = chains.kept_energies[:, 5:] - energy.of(repeated(truth, 1))
+    assert above.mean() == pytest.approx(0.5 * dimension, rel=0.08)
+    assert above.var() == pytest.approx(0.5 * dimension, rel=0.25)
+    space = search_space(plane, BOX_GRID)
+    again = space.poses(space.encode(Poses(chains.poses)))
+    np.testing.assert_allclose(again.numbers, chains.poses, atol=1e-9)
+
+
+@pytest.mark.parametrize("points", [AROUND, KnownPoints(known=AROUND.known[:2])])
+def test_energies_that_walks_carry_along_are_those_of_their_poses(points):
+    """Walks gather free points once for many moves. None ends above the floor, or out of bounds."""
+    energy = energy_of(points, noise_model(0.0005))
+    starts = repeated(TRUTH, 12)
+    floor = float(energy.of(starts).max()) + 4.0
+    chains = chains_of(energy, starts, floor, 300, 4)
+    for numbers, energies in (
+        (chains.poses, chains.energies),
+        (chains.kept.reshape(-1, 12), chains.kept_energies.reshape(-1)),
+    ):
+        poses = Poses(numbers)
+        np.testing.assert_allclose(energy.of(poses), energies, rtol=1e-12, atol=1e-9)
+        assert energies.max() <= floor
+        products = np.einsum("nij,nkj->nik", poses.rotations, poses.rotations)
+        np.testing.assert_allclose(products, np.tile(np.eye(3), (len(poses), 1, 1)), atol=1e-10)
+        assert (poses.origins >= np.array(WORKSPACE.lower) - 0.15).all()
+        assert (poses.origins <= np.array(WORKSPACE.upper) + 0.15).all()
+    assert np.abs(chains.kept - starts.numbers[:1]).max(axis=(0, 2)).min() > 1e-3
+
+
+def test_walks_from_above_come_down_to_a_floor_and_stop():
+    energy, starts = energy_of(AROUND, noise_model(0.0005)), poses_around_truth(12, 0.02, 0.2)
+    before = energy.of(starts)
+    floor = float(np.sort(before)[3])
+    down = chains_of(energy, starts, floor, 200)
+    assert (down.energies <= before).all()
+    assert (down.energies <= floor).mean() > 0.7
+    np.testing.assert_array_equal(down.poses[before <= floor], starts.numbers[before <= floor])
+    assert chains_of(energy, starts, 0.0, 200).energies.mean() < floor
+    kept = chains_of(energy, starts, -100.0, 20, 2)
+    assert np.isinf(kept.kept_energies).all()
+
+
+NOISE = noise_model(0.0005)
+CENTRE = object_centre(BOX_GRID)
+TWISTS = twists_of(SE3Space(), CENTRE)
+X, Y, Z = 0.5 * BOX_SIDES
+FOREIGN = apply(TRUTH, np.array([[0.0, 0.0, Z + 0.03]]))
+FREE = np.array([[X - 0.004, 0.02, 0.01], [X - 0.003, -0.02, 0.01], [X - 0.006, 0.0, -0.01]])
+OCCUPIED = np.array([[0.02, 0.01, -Z - 0.003], [-0.02, 0.01, -Z - 0.004]])
+AT_ODDS = KnownPoints(
+    free=apply(TRUTH, np.concatenate([FREE, [[0.03, Y - 0.004, 0.01], [0.04, Y - 0.015, -0.01]]])),
+    occupied=apply(TRUTH, OCCUPIED),
+    known=np.concatenate(
+        [apply(TRUTH, on_faces(24, 0.001 * np.random.default_rng(1).standard_normal(24))), FOREIGN]
+    ),
+)
+"""Contacts off by 1 mm, one on another object, and free and occupied voxels that are wrong."""
+
+
+def off_truth(poses):
+    """Metres and radians (B,)."""
+    off = Poses.of(poses.matrices @ TRUTH)
+    return np.sqrt((off.translations**2).sum(axis=1)), rotation_angle(off.rotations)
+
+
+def test_a_fit_ends_where_no_motion_lowers_the_plain_formula():
+    """Points of all classes disagree there, so that each must have its weight and its sign."""
+    poses = poses_around_truth(6, 0.01, 0.1)
+    found = fitted(energy_of(AT_ODDS, NOISE), TWISTS, poses, 60)
+    before = plain_energies(NOISE, BOX_GRID, AT_ODDS, poses)
+    after = plain_energies(NOISE, BOX_GRID, AT_ODDS, found)
+    assert (after < before - 10.0).all()
+
+    def moved(twist):
+        angle = np.sqrt((twist[:3] ** 2).sum())
+        turn = axis_angle(twist[:3] / max(angle, 1e-9), angle / 0.1)
+        pose = Poses.of((compose(turn, twist[3:]) @ found.matrices[0])[None])
+        return float(plain_energies(NOISE, BOX_GRID, AT_ODDS, pose)[0])
+
+    options = {"xtol": 1e-5, "ftol": 1e-6, "direc": 1e-3 * np.eye(6)}
+    least = minimize(moved, np.zeros(6), method="Powell", options=options)
+    assert least.nfev > 60
+    assert after[0] - least.fun < 0.01
+    known = BOX_GRID.at(apply(found.matrices[0], AT_ODDS.known), lookup="trilinear")[0]
+    assert np.abs(known[:24]).max() < 0.006
+    assert abs(known[24] - 0.03) < 0.002  # the foreign contact moves nothing
+
+
+def test_fits_by_rough_then_exact_noise_come_from_afar():
+    rough = NoiseModel((0.015,) * LEVELS, (1.0 / LEVELS,) * LEVELS, softness=0.01, wrong=50.0)
+    points = KnownPoints(known=np.concatenate([apply(TRUTH, on_faces(24)), FOREIGN]))
+    energy = energy_of(points, NOISE)
+    poses = poses_around_truth(40, 0.03, 0.3)
+    shift, turn = off_truth(fitted(energy, TWISTS, fitted(energy.by(rough), TWISTS, poses, 20), 30))
+    arrived = (shift < 0.001) & (turn < 0.01)
+    assert arrived.mean() > 0.8
+    assert (np.array(off_truth(poses)) > [[0.029], [0.29]]).all()
+
+
+def test_no_fit_raises_an_energy_and_none_of_no_steps_moves():
+    energy, poses = energy_of(AT_ODDS, NOISE), poses_around_truth(40, 0.1, 1.5)
+    assert (energy.of(fitted(energy, TWISTS, poses, 4)) <= energy.of(poses)).all()
+    np.testing.assert_array_equal(fitted(energy, TWISTS, poses, 0).numbers, poses.numbers)
+
+
+def test_on_a_plane_fits_stay_on_it():
+    space = search_space(PlaneSettings(plane_height=0.3), BOX_GRID)
+    poses = space.poses(space.encode(poses_around_truth(6, 0.01, 0.1)))
+    energy = energy_of(KnownPoints(known=contacts_on(BOX, 20)), NOISE)
+    found = fitted(energy, twists_of(space, CENTRE), poses, 10)
+    assert (energy.of(found) < energy.of(poses)).all()
+    again = space.poses(space.encode(found))
+    np.testing.assert_allclose(again.numbers, found.numbers, atol=1e-9)
