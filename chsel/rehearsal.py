@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
 from chsel.methods.method import Method
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.compiler import cache_directory
@@ -51,6 +52,7 @@ def warm_up(method: Method) -> None:
             assert step.hypotheses is not None
             assert step.problem is not None
             result_numbers(step.hypotheses, step.problem, np.eye(4), None)
+            Anchored(_brief(AnchoredSettings())).minima(step.problem)  # see trust_by
 
 
 def warm_up_sensing() -> None:

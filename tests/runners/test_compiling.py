@@ -18,6 +18,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
 SESSION = """
 import sys
+import chsel.methods
 from numba.core.dispatcher import Dispatcher
 from runners import probe
 
@@ -35,6 +36,10 @@ def noting(*given):
     compiled.update(specialised())
     return run(*given)
 
+class Always(str):  # as if every verdict needed rivals
+    __eq__ = lambda self, other: True
+
+chsel.methods.DETERMINED = Always()
 compiled, run, probe.run = set(), probe.run, noting
 probe.main()
 print("torch", "torch" in sys.modules)
