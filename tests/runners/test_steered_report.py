@@ -8,6 +8,7 @@ from runners import report
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.sections import sections_of
 from runners.reporting.statistics import (
+    LEAST_ERROR,
     bootstrap_interval,
     geometric_means,
     paired,
@@ -49,6 +50,17 @@ def test_a_session_that_ends_early_keeps_its_error(tmp_path, rows):
     ratios = ratios_to_best(found)
     assert ratios[1] == pytest.approx(1.0)
     assert ratios[3] == pytest.approx((4.0 * 9.0 * 60.0 / (20.0 * 30.0 * 65.0)) ** (1 / 3))
+
+
+def test_sessions_are_compared_up_to_the_smallest_budget(tmp_path, rows, monkeypatch):
+    monkeypatch.setitem(BUDGETS, "grid", 3)
+    found = sessions_of(tmp_path, rows)
+    assert (found.budget, list(found.errors.columns)) == (3, [1, 2, 3])
+
+
+def test_errors_below_a_tenth_of_a_millimetre_count_as_that(tmp_path):
+    found = sessions_of(tmp_path, session("can", 20, "information", [80.0, 8.0, 4.0, 0.0]))
+    assert geometric_means(found.errors).loc["information", 4] == pytest.approx(LEAST_ERROR)
 
 
 def test_policies_are_compared_in_the_trials_that_all_have_finished(tmp_path, rows):
