@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from chsel.numerics.arrays import digest
-from chsel.problem.registration_problem import NullObserver
 from chsel.problem.streams import StreamKey
 from chsel.qd import emitters
 from chsel.qd.archive import GridArchive
@@ -22,6 +21,7 @@ from chsel.qd.emitters import (
     mega_search,
 )
 from chsel.qd.measures import VECTOR, Measure, MeasureCode
+from tests.chsel.methods.scene import Watcher
 
 QUADRATIC, FLAT, NAN, INFINITE, NAN_BEYOND, NAN_GRADIENT = range(6)
 MEASURE = Measure(("x", "y"), MeasureCode(VECTOR, 2))
@@ -88,33 +88,16 @@ def searches_of_a_landscape(searches_around):
     searches_around(cost_of, cost_and_gradient_of, measures_of, measure_gradients_of)
 
 
-class Watcher(NullObserver):
-    """Wants snapshots at an interval."""
-
-    def __init__(self, interval):
-        self.snapshot_interval = interval
-        self.heard: list[tuple[str, int]] = []
-
-    def trace(self, stage, iteration, vectors, cost):
-        self.heard.append(("trace", iteration))
-
-    def progress(self, stage, iteration, total):
-        self.heard.append((stage, iteration))
-
-    def snapshot(self, archive):
-        self.heard.append(("snapshot", archive.iteration))
-
-
 def empty_archive():
     return GridArchive(MEASURE, np.full(2, -0.5), np.full(2, 0.5), bins=8, dimension=4)
 
 
-def found(name, kind, interval=0, count=COUNT):
+def found(name, kind, interval=0):
     """The archive after a search."""
     archive = empty_archive()
     objective: Any = LandscapeObjective(kind)
-    observer = Watcher(interval) if interval else NullObserver()
-    fill_archive(name, objective, archive, START, count, SETTINGS, StreamKey(4, 0), observer)
+    observer = Watcher(snapshot_interval=interval)
+    fill_archive(name, objective, archive, START, COUNT, SETTINGS, StreamKey(4, 0), observer)
     return archive
 
 
@@ -167,16 +150,6 @@ def test_iterations_between_calls_change_no_byte(name):
     assert len({bytes_of(found(name, QUADRATIC, interval)) for interval in (0, 1, 7, 25)}) == 1
 
 
-@pytest.mark.parametrize("total", [0, 16])
-def test_an_observer_hears_every_ten_iterations_and_at_its_interval(total):
-    watcher, objective, settings = Watcher(7), LandscapeObjective(QUADRATIC), EmitterSettings(total)
-    key, archive = StreamKey(4, 0), empty_archive()
-    fill_archive("cma_me", objective, archive, START, COUNT, settings, key, watcher)
-    expected = [("snapshot", 7), ("trace", 10), ("cma_me", 10), ("snapshot", 14)]
-    expected += [("trace", 16), ("cma_me", 16), ("snapshot", 16)]
-    assert watcher.heard == [("trace", 0), ("snapshot", 0), *(expected if total else [])]
-
-
 @pytest.mark.parametrize("name", SEARCHES)
 @pytest.mark.parametrize("kind", [NAN, INFINITE])
 def test_costs_that_are_not_finite_leave_the_archive_empty(name, kind):
@@ -221,33 +194,6 @@ def test_without_improvement_it_restarts_from_the_chosen_elite(name):
 
 
 @pytest.mark.parametrize("name", SEARCHES)
-@pytest.mark.parametrize("degenerate", ["covariance", "step"])
-def test_a_degenerate_strategy_restarts_although_it_improved(name, degenerate):
-    stepper = Stepper(name)
-    strategy = stepper.search.strategy
-    if degenerate == "covariance":
-        strategy.eigenvalues[0] = 1e-20
-    else:
-        strategy.sigma[0] = 1e-13
-    stepper.step(QUADRATIC)
-    assert len(stepper.archive.occupied) > 0
-    assert strategy.evaluations[0] == 0
-    assert strategy.sigma[0] == 0.2
-    assert (stepper.archive.solutions == center(stepper.search)).all(axis=1).any()
-
-
-@pytest.mark.parametrize("name", SEARCHES)
-def test_vectors_that_are_not_finite_are_not_evaluated(name):
-    stepper = Stepper(name)
-    stepper.step(QUADRATIC)
-    stepper.search.strategy.sigma[0] = np.inf
-    stepper.step(QUADRATIC)  # a landscape raises where it is asked for such a vector
-    assert stepper.search.strategy.sigma[0] == 0.2
-    assert np.isfinite(center(stepper.search)).all()
-    assert np.isfinite(stepper.archive.solutions).all()
-
-
-@pytest.mark.parametrize("name", SEARCHES)
 def test_on_a_flat_cost_it_restarts_as_soon_as_all_rank_alike(name):
     stepper = Stepper(name)
     restarts = 0
@@ -256,32 +202,3 @@ def test_on_a_flat_cost_it_restarts_as_soon_as_all_rank_alike(name):
         restarts += int(stepper.search.strategy.evaluations[0] == 0)
     assert restarts > 5
     np.testing.assert_array_equal(stepper.archive.costs, 1.0)
-
-
-def test_theta_moves_by_adam_towards_the_weighted_mean_of_the_parents():
-    stepper = Stepper("cma_mega")
-    theta, first, second = START, np.zeros(4), np.zeros(4)
-    for t in range(1, 4):
-        stepper.step(QUADRATIC)
-        branches = stepper.search.branches
-        parents = int((branches.status > 0).sum())
-        assert parents > 1
-        raw = np.log(parents + 0.5) - np.log(np.arange(parents) + 1.0)
-        best = branches.vectors[branches.order[:parents]]
-        towards = (raw / raw.sum()) @ best - theta
-        first = 0.9 * first + 0.1 * towards
-        second = 0.999 * second + 0.001 * towards**2
-        corrected = np.sqrt(second / (1.0 - 0.999**t)) + 1e-8
-        theta = theta + 0.05 * first / (1.0 - 0.9**t) / corrected
-        np.testing.assert_allclose(stepper.search.theta, theta, rtol=1e-12, atol=1e-15)
-
-
-def test_branches_leave_theta_along_normalised_gradients():
-    stepper = Stepper("cma_mega")
-    stepper.step(QUADRATIC)
-    search = stepper.search
-    downhill = -2.0 * (np.arange(4) + 1.0) * START
-    rows = [downhill / np.sqrt(downhill @ downhill), [1, 0, 0, 0], [0, 1, 0, 0]]
-    np.testing.assert_allclose(search.directions, rows, atol=1e-7)
-    expected = START + search.coefficients @ search.directions
-    np.testing.assert_allclose(search.branches.vectors, expected, rtol=1e-14)
