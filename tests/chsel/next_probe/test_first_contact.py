@@ -127,20 +127,6 @@ def test_first_contacts_are_those_of_the_definition():
         np.testing.assert_allclose(found.contact[0, n], place, rtol=0, atol=1e-12)
 
 
-def test_contacts_move_with_pose_and_hand():
-    stream = np.random.default_rng(4)
-    world = compose(random_rotations(stream, 1)[0], np.array([0.1, -0.2, 0.3]))
-    poses = at(*stream.uniform(-0.05, 0.05, (6, 3)).tolist())
-    actions = along_x([(0.0, 0.0), (0.04, 0.03), (-0.05, 0.02)])
-    moved = Actions(world @ actions.world_from_hand, actions.length)
-    weights = np.full(6, 1.0 / 6.0)
-    here = first_contacts(ball(), Belief(poses, weights), actions, box_hand())
-    there = first_contacts(ball(), Belief(poses @ inverse(world), weights), moved, box_hand())
-    assert there.travel == pytest.approx(here.travel, abs=2e-3)
-    expected = apply(world, here.contact.reshape(-1, 3)).reshape(here.contact.shape)
-    assert np.median(np.linalg.norm(there.contact - expected, axis=-1)) < 0.004
-
-
 def test_threads_and_other_actions_change_no_bit(threads):
     stream = np.random.default_rng(6)
     poses = at(*stream.uniform(-0.1, 0.1, (60, 3)).tolist())
