@@ -83,18 +83,10 @@ def test_where_it_converges_is_where_trimesh_does():
 
 
 def test_the_object_is_found_where_it_was_touched_all_over():
-    method = Icp(DENSE)
-    found = method.register(posed())
+    found = Icp(DENSE).register(posed())
     position, rotation = pose_errors(found.object_from_world, TRUTH, ObjectSymmetry())
     assert position[0] < 0.005
     assert rotation[0] < 0.05
-    assert (np.diff(found.cost) >= 0.0).all()
-    assert found.archive is None
-    np.testing.assert_array_equal(found.elites, found.object_from_world)
-    model = cKDTree(method.surface(posed()))
-    for transform, cost in zip(found.object_from_world, found.cost, strict=True):
-        distances = model.query(apply(transform, CONTACTS))[0]
-        assert cost == pytest.approx(np.sqrt((distances**2).mean()), rel=1e-12)
 
 
 def test_exact_touches_of_a_large_object_are_met_to_two_millimetres():
@@ -177,17 +169,6 @@ def test_what_contacts_leave_open_stays_as_it_was():
         assert np.trace(turn) == pytest.approx(1.0 + 2.0 * cosine, abs=1e-9)
 
 
-def test_contacts_matched_with_one_point_do_not_turn_the_object():
-    far = around_truth(30, 0.4)
-    far[:, :3, 3] *= 1.0 + 2.0 * np.arange(30)[:, None]
-    problem = posed(initial_set=far)
-    tree = cKDTree(Icp().surface(problem))
-    alone = [len(set(tree.query(apply(start, CONTACTS))[1])) == 1 for start in far]
-    assert sum(alone) > 5
-    turned = after(problem, 1)[alone, :3, :3]
-    np.testing.assert_allclose(turned, far[alone, :3, :3], atol=1e-9)
-
-
 def test_mirrored_contacts_are_not_met_by_a_reflection():
     mirrored = apply(TRUTH, apply(inverse(TRUTH), CONTACTS) * [1.0, 1.0, -1.0])
     turns = random_rotations(np.random.default_rng(0), 20)
@@ -202,10 +183,3 @@ def test_without_contacts_the_initial_set_comes_back():
     found = Icp().register(problem)
     np.testing.assert_array_equal(found.object_from_world, problem.initial_set)
     np.testing.assert_array_equal(found.cost, np.zeros(8))
-
-
-def test_one_start_and_no_iteration_will_do():
-    problem = posed(initial_set=around_truth(1, 0.4))
-    found = Icp(IcpSettings(iterations=0)).register(problem)
-    np.testing.assert_array_equal(found.object_from_world, problem.initial_set)
-    assert found.cost[0] > Icp().register(problem).cost[0]
