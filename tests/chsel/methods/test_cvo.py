@@ -123,15 +123,16 @@ def problem(points, initial_set, workspace=WORKSPACE):
     return RegistrationProblem(SDF, points, initial_set, workspace, 0.02, StreamKey(0, 0))
 
 
-def value(product, object_from_world):
-    return float(values_of(product, Poses.of(object_from_world[None]).numbers)[0])
+def values(product, transforms):
+    return values_of(product, Poses.of(transforms).numbers)
 
 
-def direction(product, object_from_world):
-    """The unit flow (6,)."""
-    out = np.empty((1, 7))
-    flows(product, Poses.of(object_from_world[None]).numbers, out)
-    return out[0, 1:] / np.sqrt((out[0, 1:] ** 2).sum())
+def flow(product, transforms):
+    """Sums (B, 6) over x_i x h_i and h_i."""
+    out = np.full((len(transforms), 7), np.nan)
+    flows(product, Poses.of(transforms).numbers, out)
+    np.testing.assert_allclose(out[:, 0], values(product, transforms), rtol=1e-12)
+    return out[:, 1:]
 
 
 @numba.njit
@@ -155,15 +156,17 @@ def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion():
     dense, product, gains = DenseClouds(points), product_of(points), []
     near = np.linspace(-0.05, 0.05, 9)
     for start in nearby(8, 6):
-        before = value(product, start)
+        before = values(product, start[None])[0]
         climbers = climbers_at(product, Poses.of(start[None]).numbers)
         climb(product, ASCENT, climbers, 1, 0, 1, None)
-        xi = direction(product, start)
+        xi = flow(product, start[None])[0]
+        xi /= np.sqrt((xi**2).sum())
         expansion = np.polyfit(near, [dense.product(along(start, xi, tau)) for tau in near], 8)[-5:]
         roots = np.roots(np.polyder(expansion))
         real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0.0)]
         tau = np.clip(real.min(initial=0.8), 1e-4, 0.8)
-        gains.append((climbers.value[0] - before, value(product, along(start, xi, tau)) - before))
+        theirs = values(product, along(start, xi, tau)[None])[0]
+        gains.append((climbers.value[0] - before, theirs - before))
     ours, theirs = np.array(gains).T
     assert (ours >= 0.99 * theirs).all()
     assert ours.sum() >= theirs.sum()
@@ -307,18 +310,6 @@ def test_balanced_contacts_weigh_as_much_as_free_points():
     )
     plain = Cvo(QUICK).register(problem(points, starts))
     assert np.abs(plain.object_from_world - balanced.object_from_world).max() > 1e-3
-
-
-def values(product, transforms):
-    return values_of(product, Poses.of(transforms).numbers)
-
-
-def flow(product, transforms):
-    """Sums (B, 6) over x_i x h_i and h_i."""
-    out = np.full((len(transforms), 7), np.nan)
-    flows(product, Poses.of(transforms).numbers, out)
-    np.testing.assert_allclose(out[:, 0], values(product, transforms), rtol=1e-12)
-    return out[:, 1:]
 
 
 def test_a_field_gives_what_the_sum_over_all_pairs_gives():

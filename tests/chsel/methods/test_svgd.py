@@ -5,27 +5,26 @@ import numpy as np
 import pytest
 import torch
 
-from chsel import KnownPoints, RegistrationProblem, RelaxedCost
+from chsel import RegistrationProblem, RelaxedCost
 from chsel.errors import SettingError
 from chsel.methods import svgd as kernels
 from chsel.methods.svgd import Particles, Svgd, SvgdSettings, direct, particles_at
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
-from chsel.problem.poses import Poses, apply, inverse
+from chsel.problem.poses import Poses
 from chsel.problem.search_space import SE3Space
 from chsel.problem.streams import StreamKey
 from tests.chsel.methods.scene import (
-    BOX,
-    BOX_GRID,
+    GRID,
+    SIDE,
     TRUTH,
     WORKSPACE,
     Watcher,
     around_truth,
-    contacts_on,
+    known_points,
 )
 from tests.chsel.samples import decode
 
-CONTACTS = contacts_on(BOX, 15)
 ADAM = {"lr": 0.005, "betas": (0.9, 0.999), "eps": 1e-8}
 
 
@@ -57,17 +56,11 @@ def directions_by_torch(vectors, scores, scale, *, median=False):
     return (kernel.detach() @ scores - pull) / count
 
 
-def free_points():
-    lattice = np.stack(np.meshgrid(*[np.arange(-0.1, 0.6, 0.05)] * 3, indexing="ij"), -1)
-    free = lattice.reshape(-1, 3)
-    distance, _ = BOX_GRID.at(apply(inverse(TRUTH), free))
-    return free[distance > 0.01]
-
-
-def posed(points=None, initial_set=None):
-    points = points or KnownPoints(free=free_points(), known=CONTACTS)
+def posed(initial_set=None):
     initial_set = around_truth() if initial_set is None else initial_set
-    return RegistrationProblem(BOX_GRID, points, initial_set, WORKSPACE, 0.05, StreamKey(5, 2))
+    return RegistrationProblem(
+        GRID, known_points(TRUTH, 15), initial_set, WORKSPACE, SIDE, StreamKey(5, 2)
+    )
 
 
 @pytest.mark.parametrize("median", [False, True])

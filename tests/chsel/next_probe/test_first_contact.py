@@ -72,18 +72,6 @@ def test_a_flat_hand_meets_a_ball_at_its_nearest_point(ahead):
     assert not found.contact[0, ~met].any()
 
 
-def test_a_hand_that_passes_beside_the_object_misses_it():
-    edges = RADIUS + np.array([0.01, 0.02]) * [1.0, 1.0]  # half the hand across z and across y
-    near, far = edges - 0.006, edges + 0.002
-    wide_y = np.ptp(apply(along_x([(0.0, 0.0)]).world_from_hand[0], box_hand().vertices), axis=0)[1]
-    edge_y, edge_z = (1, 0) if wide_y > 0.03 else (0, 1)
-    places = [(near[edge_y], 0.0), (far[edge_y], 0.0), (0.0, -near[edge_z]), (0.0, -far[edge_z])]
-    found = first_contacts(
-        ball(), Belief(at((0.0, 0.0, 0.0)), np.ones(1)), along_x(places), box_hand()
-    )
-    assert np.isfinite(found.travel[0]).tolist() == [True, False, True, False]
-
-
 def by_definition(sdf, pose, world_from_hand, hand):
     """The least way over the fine points around the three of the seen points that are met first."""
     surface, front = touched_points(sdf), hand.front

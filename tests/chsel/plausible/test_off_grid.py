@@ -10,9 +10,7 @@ from chsel.errors import SdfError, SettingError
 from chsel.numerics.threads import threads
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import (
-    load_plausible,
     plausible_set,
-    save_plausible,
     stepped,
 )
 from chsel.plausible.plausible_settings import (
@@ -155,16 +153,6 @@ def test_modes_take_the_places_of_others_where_there_are_too_many():
     assert len(found.cost) == 10
     assert len(below(found)) == found.local.sum() > 0
     np.testing.assert_array_equal(found.truth, np.eye(4))
-
-
-def test_a_set_with_modes_is_read_as_it_was_written(tmp_path):
-    problem, truth = touched_ball(), np.eye(4)
-    found = plausible_set(problem, truth, SEARCH)
-    save_plausible(tmp_path, found)
-    assert load_plausible(tmp_path, problem, PLAIN) is None
-    read = load_plausible(tmp_path, problem, SEARCH, world_from_object=truth)
-    assert read is not None
-    assert (read.digest, read.settings) == (found.digest, SEARCH)
 
 
 def test_an_object_without_a_surface_is_one_clear_error():

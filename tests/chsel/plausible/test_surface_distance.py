@@ -103,15 +103,6 @@ def test_coverage_and_plausibility_are_the_means_of_the_nearest():
     assert metrics.root == pytest.approx(5.5**0.5)
 
 
-def test_moving_everything_alike_changes_nothing(box):
-    estimates, members = poses(8, 5), poses(9, 7)
-    motion = compose(random_rotations(np.random.default_rng(10), 1), np.array([[0.5, -1.0, 2.0]]))
-    distance = distance_of(box)
-    still = distance.between(inverse(estimates), members)
-    moved = distance.between(inverse(motion @ estimates), motion @ members)
-    np.testing.assert_allclose(moved, still, rtol=1e-8)
-
-
 def test_threads_change_nothing(box):
     distance = distance_of(box)
     estimates, members = inverse(poses(11, 9)), poses(12, 8)
