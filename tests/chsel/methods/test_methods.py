@@ -94,13 +94,6 @@ def test_results_are_whole_and_neither_observers_nor_threads_change_a_bit(name, 
     assert method.register(problem, Watcher(snapshot_interval=2)).digest == found.digest
     with threads(2):
         assert method.register(problem).digest == found.digest
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", METHODS)
-def test_one_hypothesis_is_enough(name, preset):
-    method = quick(name, preset)
-    problem = posed(method, FEW)
     assert_whole(method.register(replace(problem, initial_set=problem.initial_set[:1])), 1)
 
 
