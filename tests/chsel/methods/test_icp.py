@@ -24,14 +24,10 @@ from tests.chsel.samples import box_distance
 
 CONTACTS = contacts_on(MESH, 40)
 DENSE = IcpSettings(surface_points=5000)
+KEY = StreamKey(5, 2)
 
 
-def posed(
-    known=CONTACTS,
-    initial_set=None,
-    key=StreamKey(5, 2),  # noqa: B008, which is frozen
-    **points,
-):
+def posed(known=CONTACTS, initial_set=None, key=KEY, **points):
     initial_set = around_truth(angle=0.4) if initial_set is None else initial_set
     return RegistrationProblem(
         GRID, KnownPoints(known=known, **points), initial_set, WORKSPACE, 0.02, key
@@ -46,7 +42,6 @@ def after(problem, iterations):
 
 
 def last_transforms(kept):
-    """The transforms (B, 4, 4) of the last trace."""
     return SE3Space().poses(kept.traces[-1].vectors).matrices
 
 
