@@ -155,5 +155,5 @@ def test_what_cannot_be_measured_is_named(box):
         SurfaceDistance(box[0], None, np.zeros((1, 3)), DistanceSettings(method="exact"))
     with pytest.raises(EvaluationError, match="the rank among 1 hypotheses"):
         true_pose_rank(distance_of(box), poses(0, 1), np.eye(4))
-    with pytest.raises(EvaluationError, match=r"shape .0, 3\."):
+    with pytest.raises(EvaluationError, match="distances have shape"):
         plausible_diversity(np.zeros((0, 3)))
