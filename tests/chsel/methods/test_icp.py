@@ -164,6 +164,17 @@ def test_what_contacts_leave_open_stays_as_it_was():
         assert np.trace(turn) == pytest.approx(1.0 + 2.0 * cosine, abs=1e-9)
 
 
+def test_contacts_matched_with_one_point_do_not_turn_the_object():
+    far = around_truth(30, 0.4)
+    far[:, :3, 3] *= 1.0 + 2.0 * np.arange(30)[:, None]
+    problem = posed(initial_set=far)
+    tree = cKDTree(Icp().surface(problem))
+    alone = [len(set(tree.query(apply(start, CONTACTS))[1])) == 1 for start in far]
+    assert sum(alone) > 5
+    turned = after(problem, 1)[alone, :3, :3]
+    np.testing.assert_allclose(turned, far[alone, :3, :3], atol=1e-9)
+
+
 def test_mirrored_contacts_are_not_met_by_a_reflection():
     mirrored = apply(TRUTH, apply(inverse(TRUTH), CONTACTS) * [1.0, 1.0, -1.0])
     turns = random_rotations(np.random.default_rng(0), 20)

@@ -58,6 +58,7 @@ def test_gains_are_those_of_the_formulas(seed, count, reach):
     surviving = np.einsum("i,ija,j->a", weights, alike**2, weights)
     assert forecast.hit_chance == pytest.approx(weights @ hit, abs=1e-12)
     assert (expected > 0.5).sum() >= 2 or count == 1
+    assert (gains.information >= 0.0).all()
     assert gains.information == pytest.approx(expected, abs=1e-9)
     assert gains.surviving == pytest.approx(surviving, abs=1e-9)
     assert gains.expected_spread == pytest.approx(np.sqrt(squares), abs=1e-9)

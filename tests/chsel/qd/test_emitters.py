@@ -175,6 +175,15 @@ def test_without_improvement_it_restarts_from_the_chosen_elite(name):
 
 
 @pytest.mark.parametrize("name", SEARCHES)
+def test_a_tiny_step_restarts_a_search_although_it_improved(name):
+    stepper = Stepper(name)
+    stepper.search.strategy.sigma[0] = 1e-13
+    stepper.step(QUADRATIC)
+    assert len(stepper.archive.occupied) > 0
+    assert stepper.search.strategy.sigma[0] == 0.2
+
+
+@pytest.mark.parametrize("name", SEARCHES)
 def test_on_a_flat_cost_it_restarts_as_soon_as_all_rank_alike(name):
     stepper = Stepper(name)
     restarts = 0
