@@ -106,9 +106,6 @@ ODD = {
     "depths": KnownPoints(known=_KNOWN[:4], known_sdf=[0.05, -0.01, 0.0, 0.3]),
     "contradictory": KnownPoints(free=_KNOWN, known=_KNOWN),
     "far": KnownPoints(free=_FREE + 1e6, known=_KNOWN + 1e6),
-    "a stray contact": KnownPoints(known=np.concatenate([_KNOWN, [[1e9, 1e9, 1e9]]])),
-    "vast": KnownPoints(free=[[1e200, 0.0, 0.0]], known=[[1e150, 0.0, 0.0]]),
-    "all over": KnownPoints(free=np.linspace([0.0, 0.0, 0.0], [1e200, -1e200, 1e200], 2500)),
 }
 """Points that tell little, or are hardly those of an object."""
 

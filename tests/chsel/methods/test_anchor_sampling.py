@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 
-from chsel.methods.anchor_kernels import NO_POSE, UNIT, Box32, CoarseScore, keep_best
+from chsel.methods.anchor_kernels import UNIT
 from chsel.methods.anchor_sampling import AnchorSampler, AnchorSettings, most_informative_first
 from chsel.numerics.threads import threads
 from chsel.problem.points import KnownPoints
-from chsel.problem.poses import apply, axis_angle, compose, random_rotations, rotated
-from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.poses import apply, axis_angle, compose
 from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
-from chsel.problem.streams import StreamKey
-from tests.chsel.methods.scene import BOX, BOX_GRID, WORKSPACE, contacts_on
+from tests.chsel.methods.scene import BOX, BOX_GRID, WORKSPACE, box_problem, contacts_on
 
 CONTACTS = contacts_on(BOX, 12)
 PAIRS, SINGLES = AnchorSettings(1.0, 0.0), AnchorSettings(0.0, 1.0)
@@ -20,11 +18,8 @@ UNIFORM = AnchorSettings(0.0, 0.0)
 
 def drawn(points, settings, samples=3000, most=3000, plane=None, index=0, left_out=0):
     """The best poses (K, 12); all of them where most is as many."""
-    problem = RegistrationProblem(
-        BOX_GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2)
-    )
     space, known = search_space(plane, BOX_GRID), most_informative_first(points)
-    sampler = AnchorSampler(problem, known, space, settings)
+    sampler = AnchorSampler(box_problem(points), known, space, settings)
     return sampler.best(samples, most, index=index, left_out=left_out).numbers
 
 
@@ -47,27 +42,18 @@ def test_pairs_put_the_surface_onto_two_contacts():
     assert np.median(uniform) > 0.03
 
 
-def test_one_contact_is_met_by_every_pose_that_is_anchored_on_it():
-    poses = drawn(KnownPoints(known=CONTACTS[:1]), SINGLES)
-    assert len(poses) > 300
-    assert np.abs(distances(poses, CONTACTS[:1])).max() < 0.003
-
-
-@pytest.mark.parametrize("value", [0.02, -0.01])
+@pytest.mark.parametrize("value", [0.0, 0.02, -0.01])
 def test_a_point_of_known_distance_is_met_at_that_distance(value):
     poses = drawn(KnownPoints(known=CONTACTS[:1], known_sdf=np.array([value])), SINGLES)
+    assert len(poses) > 300
     off = np.abs(distances(poses, CONTACTS[:1]) - value)
-    assert np.quantile(off, 0.8) < 0.003
+    assert np.quantile(off, 0.8 if value else 1.0) < 0.003
 
 
 def test_rotations_are_rigid_and_objects_within_bounds():
-    points = KnownPoints(known=CONTACTS)
-    problem = RegistrationProblem(
-        BOX_GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2)
-    )
-    lower, upper = origin_bounds(problem.workspace, search_space(None, BOX_GRID), 0.15)
+    lower, upper = origin_bounds(WORKSPACE, search_space(None, BOX_GRID), 0.15)
     np.testing.assert_allclose(lower, np.array(WORKSPACE.lower) - 0.15)
-    poses = drawn(points, AnchorSettings())
+    poses = drawn(KnownPoints(known=CONTACTS), AnchorSettings())
     rotations = poses[:, :9].reshape(-1, 3, 3)
     products = np.einsum("nij,nkj->nik", rotations, rotations)
     np.testing.assert_allclose(products, np.tile(np.eye(3), (len(poses), 1, 1)), atol=1e-9)
@@ -88,13 +74,6 @@ def test_the_best_are_the_first_of_all_and_do_not_depend_on_threads():
     np.testing.assert_array_equal(one, two)
     np.testing.assert_array_equal(one, every[:40])
     assert np.abs(drawn(points, AnchorSettings(), count, 40, index=1) - one).max() > 1e-3
-
-
-def test_the_best_fit_better_than_the_others():
-    poses = drawn(KnownPoints(known=CONTACTS), AnchorSettings(), 6000, 6000)
-    fits = np.abs(distances(poses, CONTACTS)).mean(axis=1)
-    assert fits[:20].max() < np.median(fits)
-    assert fits[:20].mean() < 0.5 * fits.mean()
 
 
 def test_on_a_plane_poses_stand_on_it_and_still_meet_contacts():
@@ -141,75 +120,17 @@ def test_poses_come_in_the_order_of_their_plain_scores():
     assert (scores[:30] < np.quantile(scores, 0.1)).all()
 
 
-@pytest.mark.parametrize("left_out", [0, 1])
-def test_kept_are_the_lowest_scores(left_out):
-    random = np.random.default_rng(0)
-    count, most = 3000, 30
-    grid, voxels = box((6, 5, 4), 20.0), box((4, 6, 5), 10.0)
-    score = CoarseScore(
-        lower=single(random, 0.0, 0.1, 3),
-        upper=single(random, 0.6, 0.7, 3),
-        grid=grid,
-        values=random.integers(-400, 400, 6 * 5 * 4).astype(np.int16),
-        contacts=single(random, -0.1, 0.5, 3, 7),
-        known_sdf=single(random, -200.0, 200.0, 7),
-        reach=np.float32(900.5),
-        left_out=left_out,
-        inside=single(random, 0.0, 0.2, 40, 3),
-        weights=random.integers(0, 300, 40).astype(np.int32),
-        voxels=voxels,
-        is_free=random.random(4 * 6 * 5) < 0.5,
-    )
-    turns = random_rotations(random, count).astype(np.float32)
-    shifts = single(random, -0.5, 0.5, count, 3)
-    heap = np.full(most, NO_POSE)
-    poses = np.concatenate([turns.reshape(-1, 9), shifts], axis=1)
-    keep_best(score, poses, 5, heap)
-    # The same in plain numpy, all sums in the order of the kernel.
-    steps = (
-        rotated(turns[:, None], score.contacts.T) + shifts[:, None] - grid.first
-    ) * grid.inverse
-    within = np.clip(steps, 0, grid.most)
-    beyond = np.abs(steps - within)
-    beyond = (beyond[..., 0] + beyond[..., 1] + beyond[..., 2]) * (1 / grid.inverse / UNIT)
-    off = np.abs(score.values[nodes(grid, within)] + (beyond - score.known_sdf))
-    costs = np.minimum(off, score.reach).astype(np.int64)
-    back = turns.transpose(0, 2, 1) * voxels.inverse
-    start = -rotated(back, shifts) - np.array(voxels.first) * voxels.inverse
-    places = np.clip(rotated(back[:, None], score.inside) + start[:, None], 0, voxels.most)
-    totals = costs.sum(axis=1) - left_out * costs.max(axis=1)
-    totals += (score.is_free[nodes(voxels, places)] * score.weights).sum(axis=1)
-    origins = -rotated(turns.transpose(0, 2, 1), shifts)
-    is_in = ((origins >= score.lower) & (origins <= score.upper)).all(axis=1)
-    assert 0.05 < is_in.mean() < 0.5
-    keys = (totals << 32) + 5 + np.arange(count)
-    np.testing.assert_array_equal(np.sort(heap), np.sort(keys[is_in])[:most])
-
-
-def box(shape, inverse):
-    """A grid that begins at 0.05 m."""
-    first, most = (np.float32(0.05),) * 3, tuple(np.float32(n - 1) for n in shape)
-    across, along = np.int32(shape[1] * shape[2]), np.int32(shape[2])
-    return Box32(first, np.float32(inverse), most, across, along)
-
-
-def single(random, low, high, *shape):
-    return random.uniform(low, high, shape).astype(np.float32)
-
-
-def nodes(grid, steps):
-    x, y, z = np.moveaxis((steps + np.float32(0.5)).astype(np.int64), -1, 0)
-    return x * grid.across + y * grid.along + z
-
-
 def test_the_worst_contact_can_be_left_out():
-    """One of six contacts is 80 mm off: the poses come in the order of what the others cost."""
+    """One of six points is 80 mm off: the poses come in the order of what the others cost."""
     contacts = CONTACTS[:6] + np.array([[0.0, 0.0, 0.08]] + [[0.0, 0.0, 0.0]] * 5)
-    points = KnownPoints(known=contacts)
+    values = np.array([0.0, 0.0, 0.01, -0.01, 0.005, 0.0])
+    points = KnownPoints(known=contacts, known_sdf=values)
     poses = drawn(points, AnchorSettings(), 20_000, 300, left_out=1)
-    costs = np.minimum(np.abs(distances(poses, contacts, "nearest")), 0.06)
+    costs = np.minimum(np.abs(distances(poses, contacts, "nearest") - values), 0.06)
     trimmed = costs.sum(axis=1) - costs.max(axis=1)
     np.testing.assert_allclose(trimmed, np.sort(trimmed), atol=6 * UNIT)
-    others = drawn(points, AnchorSettings(), 20_000, 300)
-    costs = np.minimum(np.abs(distances(others, contacts, "nearest")), 0.06)
+    others = drawn(points, AnchorSettings(), 20_000, 3000)
+    costs = np.minimum(np.abs(distances(others, contacts, "nearest") - values), 0.06)
+    total = costs.sum(axis=1)
+    np.testing.assert_allclose(total, np.sort(total), atol=0.002)  # many are out of the grid
     assert trimmed[0] < (costs.sum(axis=1) - costs.max(axis=1))[0]

@@ -77,20 +77,10 @@ def assert_found(found):
     assert rotation[0] < 0.05
 
 
-def test_the_object_is_found_where_it_was_touched():
+def test_results_depend_on_the_seed():
     method = anchored()
-    found = registered(method, posed(method))
-    assert_found(found)
-    assert found.distinct == 30
-
-
-def test_results_depend_on_the_seed_and_every_stage_is_reported():
-    method, watcher = anchored(), Watcher()
-    first = method.register(posed(method), watcher)
-    stages = [stage for stage, _, _ in watcher.progressed]
-    assert stages == ["sample", "fit", "search", "descend", "spread"]
     other = posed(method, key=StreamKey(4, 1))
-    assert method.register(other).digest != first.digest
+    assert method.register(other).digest != method.register(posed(method)).digest
 
 
 @pytest.mark.parametrize("name", ODD)
@@ -143,13 +133,10 @@ def test_a_good_pose_of_the_last_step_is_not_lost():
     assert_found(registered(method, problem))
 
 
-@pytest.mark.parametrize("count", [1, 700])
-def test_as_many_hypotheses_come_as_are_wanted(count):
+def test_as_many_hypotheses_come_as_are_wanted():
     method = anchored()
-    problem = posed(method, FEW)
-    initial = np.resize(problem.initial_set, (count, 4, 4))
-    found = registered(method, replace(problem, initial_set=initial))
-    assert found.distinct == count
+    initial = np.tile(np.eye(4), (700, 1, 1))
+    assert registered(method, posed(method, FEW, initial_set=initial)).distinct == 700
 
 
 def test_on_a_plane_starts_off_it_count_by_where_they_stand():
@@ -257,7 +244,7 @@ def test_poses_are_held_that_errors_shared_by_all_points_explain():
 
 
 def test_a_foreign_contact_does_not_move_the_best():
-    foreign = POINTS.known[20:22] + np.array([0.0, 0.0, 0.4])
+    foreign = POINTS.known[20:22] + np.array([[0.0, 0.0, 0.4], [1000.0, 0.0, 0.0]])
     points = KnownPoints(free=POINTS.free, known=np.concatenate([POINTS.known[:20], foreign]))
     method = anchored()
     problem = posed(method, points)
@@ -298,12 +285,6 @@ def test_a_grid_without_a_node_inside_is_one_clear_error():
     with pytest.raises(ChselError, match="no node of the SDF grid is inside") as raised:
         method.register(posed(method, sdf=grid))
     assert "\n" not in str(raised.value)
-
-
-def test_a_point_far_away_costs_no_more_than_any_that_is_off():
-    method = anchored()
-    known = np.concatenate([[[1000.0, 0.0, 0.0]], POINTS.known])
-    assert_found(registered(method, posed(method, KnownPoints(free=POINTS.free, known=known))))
 
 
 def test_hypotheses_are_chosen_for_the_least_expected_plausible_diversity():

@@ -163,10 +163,3 @@ def test_a_single_run_gives_samples_of_its_last_distribution():
     assert found.shape == (30, D)
     assert len(np.unique(found, axis=0)) == 30
     assert (np.abs(found) < 0.05).all()
-
-
-def test_a_run_from_every_start_gives_the_best_of_each():
-    starts = np.concatenate([np.ones((2, D)), np.full((1, D), -1.0)])
-    key = StreamKey(0, 0)
-    found = evolved(objective(SPHERE), starts, CmaEsSettings(), key, NullObserver())
-    np.testing.assert_allclose(found, 0.0, atol=1e-3)

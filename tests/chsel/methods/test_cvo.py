@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numba
 import numpy as np
@@ -26,7 +26,6 @@ from chsel.methods.cvo import (
     values_of,
 )
 from chsel.methods.method import Method
-from chsel.numerics.arrays import FloatArray
 from chsel.numerics.pose_tuples import pose_at
 from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors
@@ -35,9 +34,6 @@ from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, rota
 from chsel.problem.streams import StreamKey
 from tests.chsel.methods.scene import Watcher
 
-SIGMA, S_SIGMA, S_ELL = 0.1, 0.8, 0.1
-FREE, SURFACE = np.array([0.9, 0.1]), np.array([0.1, 0.9])
-C = D = 7.0
 KERNEL = Kernel(0.1, 0.0064)
 MESH = trimesh.creation.box([0.12, 0.08, 0.06])
 SDF = SdfGrid.from_mesh(MESH, 0.01, padding=0.03)
@@ -50,88 +46,44 @@ def scene(count=60):
     return KnownPoints(free=free, known=stream.uniform(-0.06, 0.06, (20, 3)))
 
 
-def product_of(points, kernel, sdf=SDF):
+def product_of(points, sdf=SDF):
     """The inner product by fields, with a surface band of a voxel."""
     parts = ("free", points.free), ("surface", points.contacts)
-    fields = {name: class_field(sdf, kernel, sdf.resolution, name) for name, _ in parts}
+    fields = {name: class_field(sdf, KERNEL, sdf.resolution, name) for name, _ in parts}
     return tuple(ClassTerm(part.T.copy(), fields[name]) for name, part in parts)
 
 
-def labels(free, surface):
-    """Of so many free points, then surface points (N, 2)."""
-    return np.concatenate([np.tile(FREE, (free, 1)), np.tile(SURFACE, (surface, 1))])
-
-
-@dataclass(frozen=True, eq=False)
 class DenseClouds:
-    """x (N, 3) of the world with labels (N, 2), z (M, 3) of the object with labels (M, 2)."""
+    """Points of the world and nodes of the object in pairs, free ones and those of the surface.
 
-    x: FloatArray
-    x_labels: FloatArray
-    z: FloatArray
-    z_labels: FloatArray
-    ell: float = 0.1
+    Labels of the two classes are so far apart that unlike points count nothing, exp(-64).
+    """
 
-    @classmethod
-    def of(cls, sdf, points, band, *, ell=0.1):
+    def __init__(self, points, sdf=SDF):
         nodes = sdf.origin + np.argwhere(sdf.values > -np.inf) * sdf.resolution
-        values = sdf.values.reshape(-1)
-        free, surface = nodes[values > band], nodes[np.abs(values) <= band]
-        x = np.concatenate([points.free, points.contacts])
-        x_labels = labels(len(points.free), len(points.contacts))
-        z = np.concatenate([free, surface])
-        return cls(x, x_labels, z, labels(len(free), len(surface)), ell)
-
-    def kernel(self, object_from_world):
-        """a_ij (N, M) = k(x_i, y_j) s(l_i, m_j)."""
-        moved = apply(object_from_world, self.x)
-        apart = ((moved[:, None] - self.z) ** 2).sum(-1)
-        labels_apart = ((self.x_labels[:, None] - self.z_labels) ** 2).sum(-1)
-        a = SIGMA**2 * np.exp(-apart / (2 * self.ell**2))
-        a *= S_SIGMA**2 * np.exp(-labels_apart / (2 * S_ELL**2))
-        return a
+        values, band = sdf.values.reshape(-1), sdf.resolution
+        surface = np.abs(values) <= band
+        self.pairs = (points.free, nodes[values > band]), (points.contacts, nodes[surface])
 
     def product(self, object_from_world):
         """F(X)."""
-        return float(self.kernel(object_from_world).sum())
+        return sum(kernel(apply(object_from_world, x), z).sum() for x, z in self.pairs)
 
     def flow(self, object_from_world):
         """(omega, u) (6,), not normalised, as sums over pairs in the world."""
-        a, y = self.kernel(object_from_world), self.y(object_from_world)
-        omega = np.einsum("nm,nmk->k", a, np.cross(self.x[:, None], y[None])) / C
-        u = np.einsum("nm,nmk->k", a, y[None] - self.x[:, None]) / D
-        return np.concatenate([omega, u])
+        total = np.zeros(6)
+        for x, z in self.pairs:
+            a = kernel(apply(object_from_world, x), z)
+            y = apply(inverse(object_from_world), z)
+            total[:3] += np.einsum("nm,nmk->k", a, np.cross(x[:, None], y[None]))
+            total[3:] += np.einsum("nm,nmk->k", a, y[None] - x[:, None])
+        return total
 
-    def y(self, object_from_world):
-        """The object's cloud in the world (M, 3)."""
-        return apply(np.linalg.inv(object_from_world), self.z)
 
-    def quartic(self, object_from_world, xi):
-        """B, C, D, E: F(G Exp(tau xi)) = F + B tau + C tau^2 + D tau^3 + E tau^4 + ..."""
-        a, y, q = self.kernel(object_from_world), self.y(object_from_world), 0.5 / self.ell**2
-        apart = self.x[:, None] - y
-        first = np.cross(xi[:3], y) + xi[3:]
-        second = np.cross(xi[:3], first)
-        third = np.cross(xi[:3], second)
-        fourth = np.cross(xi[:3], third)
-
-        def dot(p, q):
-            return (p * q).sum(-1)
-
-        beta = -2 * q * dot(first, apart)
-        gamma = -q * (dot(first, first) - dot(second, apart))
-        delta = -q * (dot(third, apart) / 3 - dot(first, second))
-        epsilon = -q * (dot(second, second) / 4 + dot(first, third) / 3 - dot(fourth, apart) / 12)
-        return np.array(
-            [
-                (a * beta).sum(),
-                (a * (gamma + beta**2 / 2)).sum(),
-                (a * (delta + beta * gamma + beta**3 / 6)).sum(),
-                (
-                    a * (epsilon + beta * delta + beta**2 * gamma / 2 + gamma**2 / 2 + beta**4 / 24)
-                ).sum(),
-            ]
-        )
+def kernel(x, z):
+    """k(x_i, z_j) (N, M), with that of like labels."""
+    apart = ((x[:, None] - z) ** 2).sum(-1)
+    return KERNEL.amplitude * np.exp(-apart / (2.0 * KERNEL.ell**2))
 
 
 def along(object_from_world, xi, tau):
@@ -171,17 +123,16 @@ def problem(points, initial_set, workspace=WORKSPACE):
     return RegistrationProblem(SDF, points, initial_set, workspace, 0.02, StreamKey(0, 0))
 
 
-def value(product, object_from_world):
-    return float(values_of(product, Poses.of(object_from_world[None]).numbers)[0])
+def values(product, transforms):
+    return values_of(product, Poses.of(transforms).numbers)
 
 
-def direction(product, object_from_world):
-    """The unit flow (6,), and the slope of F along it."""
-    out = np.empty((1, 7))
-    flows(product, Poses.of(object_from_world[None]).numbers, out)
-    xi = out[0, 1:] / 7.0
-    xi = xi / np.sqrt((xi**2).sum())
-    return xi, float((xi * out[0, 1:]).sum())
+def flow(product, transforms):
+    """Sums (B, 6) over x_i x h_i and h_i."""
+    out = np.full((len(transforms), 7), np.nan)
+    flows(product, Poses.of(transforms).numbers, out)
+    np.testing.assert_allclose(out[:, 0], values(product, transforms), rtol=1e-12)
+    return out[:, 1:]
 
 
 @numba.njit
@@ -200,32 +151,22 @@ def test_a_step_is_the_exponential_of_the_flow(tau):
         np.testing.assert_allclose(found, Poses.of(expected[None]).numbers[0], rtol=0, atol=1e-15)
 
 
-def test_the_flow_is_the_way_uphill_and_its_slope_that_of_the_inner_product():
-    points = scene()
-    dense, product = DenseClouds.of(SDF, points, 0.01), product_of(points, KERNEL)
-    for start in nearby(4, 4):
-        xi, slope = direction(product, start)
-        expected = dense.quartic(start, xi)[0]
-        assert slope > 0.0
-        assert slope == pytest.approx(expected, 0.01)
-        further = value(product, along(start, xi, 0.005)), value(product, along(start, xi, -0.005))
-        assert slope == pytest.approx((further[0] - further[1]) / 0.01, 0.02)
-
-
 def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion():
     points = scene()
-    dense, product = DenseClouds.of(SDF, points, 0.01), product_of(points, KERNEL)
-    gains = []
+    dense, product, gains = DenseClouds(points), product_of(points), []
+    near = np.linspace(-0.05, 0.05, 9)
     for start in nearby(8, 6):
-        before = value(product, start)
+        before = values(product, start[None])[0]
         climbers = climbers_at(product, Poses.of(start[None]).numbers)
         climb(product, ASCENT, climbers, 1, 0, 1, None)
-        xi, _ = direction(product, start)
-        b, c, d, e = dense.quartic(start, xi)
-        roots = np.roots([4 * e, 3 * d, 2 * c, b])
+        xi = flow(product, start[None])[0]
+        xi /= np.sqrt((xi**2).sum())
+        expansion = np.polyfit(near, [dense.product(along(start, xi, tau)) for tau in near], 8)[-5:]
+        roots = np.roots(np.polyder(expansion))
         real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0.0)]
         tau = np.clip(real.min(initial=0.8), 1e-4, 0.8)
-        gains.append((climbers.value[0] - before, value(product, along(start, xi, tau)) - before))
+        theirs = values(product, along(start, xi, tau)[None])[0]
+        gains.append((climbers.value[0] - before, theirs - before))
     ours, theirs = np.array(gains).T
     assert (ours >= 0.99 * theirs).all()
     assert ours.sum() >= theirs.sum()
@@ -233,7 +174,7 @@ def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion():
 
 
 def test_the_inner_product_never_falls_and_is_that_of_the_pose():
-    product, starts = product_of(scene(), KERNEL), nearby(5, 7, 0.2)
+    product, starts = product_of(scene()), nearby(5, 7, 0.2)
     climbers = climbers_at(product, Poses.of(starts).numbers)
     for _ in range(30):
         before = climbers.value.copy()
@@ -243,44 +184,19 @@ def test_the_inner_product_never_falls_and_is_that_of_the_pose():
         np.testing.assert_array_equal(values_of(product, climbers.poses), climbers.value)
 
 
-@pytest.mark.parametrize("name", ["default", "paper", "reference"])
-def test_a_cloud_matches_itself(name):
-    settings = replace(preset_settings("cvo", name), max_iterations=3)
-    band = SDF.resolution if settings.surface_band is None else settings.surface_band
-    nodes = SDF.origin + np.argwhere(SDF.values > -np.inf) * SDF.resolution
-    signed = SDF.values.reshape(-1)
-    free, surface = nodes[signed > band], nodes[np.abs(signed) <= band]
-    points = KnownPoints(free=free, known=surface)
-    alike = RegistrationProblem(
-        SDF, points, np.eye(4)[None], WORKSPACE, SDF.resolution, StreamKey(0, 0)
-    )
-    found = Cvo(settings).register(alike)
-    assert found.cost[0] == pytest.approx(0.0, abs=2e-3)
-    position, rotation = pose_errors(found.object_from_world, np.eye(4), ObjectSymmetry())
-    assert position[0] < 1e-3
-    assert rotation[0] < 1e-2
-
-
 def test_the_cost_is_one_minus_the_cosine_of_the_two_clouds():
     points, starts = scene(), nearby(3, 8)
     found = Cvo(replace(preset_settings("cvo", "paper"), max_iterations=2)).register(
         problem(points, starts)
     )
-    dense = DenseClouds.of(SDF, points, 0.01)
-    x = DenseClouds(dense.x, dense.x_labels, dense.x, dense.x_labels)
-    z = [dense.z[dense.z_labels[:, side] > 0.5] for side in (0, 1)]
-    norm = sum(_pair_sum(part) for part in z) * x.product(np.eye(4))
-    expected = [
-        1.0 - dense.product(transform) / np.sqrt(norm) for transform in found.object_from_world
+    dense = DenseClouds(points)
+    norms = [
+        sum(kernel(part, part).sum() for part in side) for side in zip(*dense.pairs, strict=True)
     ]
+    products = np.array([dense.product(transform) for transform in found.object_from_world])
+    expected = 1.0 - products / np.sqrt(norms[0] * norms[1])
     np.testing.assert_allclose(found.cost, expected, rtol=0, atol=2e-3)
     assert (np.diff(found.cost) >= 0.0).all()
-
-
-def _pair_sum(points):
-    return float(
-        sum(0.0064 * np.exp(-((points - z) ** 2).sum(axis=1) / 0.02).sum() for z in points)
-    )
 
 
 WORLD_FROM_OBJECT = compose(
@@ -335,12 +251,11 @@ def test_without_a_point_to_use_the_starts_come_back(settings, points):
     np.testing.assert_array_equal(found.duplicate, [False, False, True, False])
 
 
-@pytest.mark.parametrize("origin", ["world", "workspace"])
-def test_a_start_that_meets_no_point_stays_where_it_is(origin):
+def test_a_start_that_meets_no_point_stays_where_it_is():
     starts = nearby(3, 11)
     starts[1, :3, 3] += 5.0
     shifted = Workspace((-1.0, -0.3, -0.3), (0.3, 0.3, 0.3))
-    settings = replace(QUICK, origin=origin)
+    settings = replace(QUICK, origin="workspace")
     found = Cvo(settings).register(problem(scene(), starts, shifted))
     np.testing.assert_array_equal(found.object_from_world[-1], starts[1])
     assert found.cost[-1] == 1.0
@@ -357,16 +272,6 @@ def test_each_start_climbs_as_if_it_were_alone_on_any_number_of_threads():
     np.testing.assert_array_equal(together.object_from_world, expected)
 
 
-def test_an_observer_sees_the_costs_fall():
-    posed, watcher = problem(scene(), nearby(4, 14)), Watcher()
-    watched = Cvo(QUICK).register(posed, watcher)
-    assert watcher.iterations == [0, 10, 12]
-    assert watcher.progressed[-1][:2] == ("ascent", 12)
-    costs = [trace.cost for trace in watcher.traces]
-    assert (np.diff(costs, axis=0) <= 0.0).all()
-    np.testing.assert_array_equal(np.sort(costs[-1]), watched.cost)
-
-
 def test_the_length_scale_falls_from_ascent_to_ascent():
     settings = replace(QUICK, ell=0.1, ell_min=0.03, ell_decay=0.5, stop_below=None)
     assert settings.levels == [0.1, 0.05, 0.03]
@@ -378,10 +283,6 @@ def test_the_length_scale_falls_from_ascent_to_ascent():
     only = replace(settings, ell=0.03, max_iterations=1, max_step=1e-4)
     again = Cvo(only).register(replace(posed, initial_set=found.object_from_world))
     np.testing.assert_allclose(again.cost, found.cost, rtol=0, atol=1e-3)
-    coarse = Cvo(replace(only, ell=0.1, ell_min=0.1)).register(
-        problem(scene(), found.object_from_world)
-    )
-    assert (coarse.cost < found.cost - 0.1).all()
 
 
 def test_turning_about_the_workspace_the_place_of_the_world_does_not_matter():
@@ -411,27 +312,14 @@ def test_balanced_contacts_weigh_as_much_as_free_points():
     assert np.abs(plain.object_from_world - balanced.object_from_world).max() > 1e-3
 
 
-def values(product, transforms):
-    return values_of(product, Poses.of(transforms).numbers)
-
-
-def flow(product, transforms):
-    """Sums (B, 6) over x_i x h_i and h_i."""
-    out = np.full((len(transforms), 7), np.nan)
-    flows(product, Poses.of(transforms).numbers, out)
-    np.testing.assert_allclose(out[:, 0], values(product, transforms), rtol=1e-12)
-    return out[:, 1:]
-
-
 def test_a_field_gives_what_the_sum_over_all_pairs_gives():
     points, transforms = scene(), nearby(6, 0)
-    dense = DenseClouds.of(SDF, points, SDF.resolution)
-    product = product_of(points, KERNEL)
+    dense, product = DenseClouds(points), product_of(points)
     expected = np.array([dense.product(transform) for transform in transforms])
     most = dense.product(np.eye(4))
     np.testing.assert_allclose(values(product, transforms), expected, rtol=0, atol=0.002 * most)
     # The dense flow is of a, that of the field of grad f = sum a (z - p) / ell^2.
-    wanted = np.array([7.0 * dense.flow(transform) for transform in transforms])
+    wanted = np.array([dense.flow(transform) for transform in transforms])
     found = flow(product, transforms) * KERNEL.ell**2
     sizes = np.abs(wanted).max(axis=0)
     np.testing.assert_allclose(found / sizes, wanted / sizes, rtol=0, atol=0.01)
@@ -440,41 +328,31 @@ def test_a_field_gives_what_the_sum_over_all_pairs_gives():
 def test_at_the_nodes_a_field_is_the_sum_but_for_its_truncation():
     nodes = SDF.origin + np.array([[0, 0, 0], [8, 7, 5], [3, 11, 2]]) * SDF.resolution
     points = KnownPoints(free=nodes, known=nodes)
-    dense = DenseClouds.of(SDF, points, SDF.resolution)
-    expected = dense.product(np.eye(4))
-    assert values(product_of(points, KERNEL), np.eye(4)[None])[0] == pytest.approx(expected, 1e-6)
+    expected = DenseClouds(points).product(np.eye(4))
+    assert values(product_of(points), np.eye(4)[None])[0] == pytest.approx(expected, 1e-6)
 
 
 def test_a_coarser_field_stands_for_a_fine_grid_all_the_same():
     fine = SdfGrid.from_mesh(trimesh.creation.box([0.06, 0.04, 0.03]), 0.004, padding=0.02)
     points, transforms = scene(60), nearby(4, 5)
-    dense = DenseClouds.of(fine, points, fine.resolution)
-    product = product_of(points, KERNEL, fine)
+    dense, product = DenseClouds(points, fine), product_of(points, fine)
     assert product[0].field.box.inverse == pytest.approx(1.0 / 0.008)
     expected = np.array([dense.product(transform) for transform in transforms])
     most = dense.product(np.eye(4))
     np.testing.assert_allclose(values(product, transforms), expected, rtol=0, atol=0.002 * most)
 
 
-def pair_sum(points):
-    total = 0.0
-    for point in points:
-        apart = np.minimum(np.abs(points - point), 1e3)
-        total += np.exp(-(apart**2).sum(axis=1) / (2 * KERNEL.ell**2)).sum()
-    return KERNEL.amplitude * float(total)
-
-
 @pytest.mark.parametrize("count", [50, 2100])
 def test_the_norm_of_a_cloud_is_the_sum_over_its_pairs(count):
     points = np.random.default_rng(0).uniform(-0.2, 0.3, (count, 3))
-    assert cloud_norm(points, KERNEL, 0.01) == pytest.approx(pair_sum(points), 1e-12)
+    assert cloud_norm(points, KERNEL, 0.01) == pytest.approx(kernel(points, points).sum(), 1e-12)
 
 
 def test_the_norm_of_lattice_points_is_that_of_a_field_at_its_nodes():
     lattice = np.indices((14, 15, 16)).reshape(3, -1).T
     points = (lattice * 0.0228)[np.random.default_rng(0).random(len(lattice)) < 0.9] + 0.1234
     found = cloud_norm(points, KERNEL, 0.0228)
-    assert found == pytest.approx(pair_sum(points), 1e-3)
+    assert found == pytest.approx(kernel(points, points).sum(), 1e-3)
 
 
 @pytest.mark.parametrize("spacing", [0.01, 0.0228])

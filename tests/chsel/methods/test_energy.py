@@ -61,12 +61,3 @@ def test_energy_is_the_plain_formula(points, shared):
     counted = min(len(points.known), INDEPENDENT)
     found = energy_of(points, noise).of(poses)
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9 + TABLE_ERROR * counted)
-
-
-def test_the_same_points_by_another_noise():
-    points, poses = points_with(6), near_and_far()
-    energy = energy_of(points, noise_model(SENSOR))
-    other = noise_model(0.003, 0.002)
-    again = energy.by(other).of(poses)
-    np.testing.assert_array_equal(again, energy_of(points, other).of(poses))
-    assert (again < energy.of(poses)).all()

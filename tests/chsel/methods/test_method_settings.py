@@ -12,47 +12,27 @@ import pytest
 from chsel.cost.cost_settings import CostSettings
 from chsel.errors import SettingError
 from chsel.methods import OURS, build_method, preset_settings
-from chsel.methods.anchor_sampling import AnchoredStarts, AnchorSettings
 from chsel.methods.anchored.anchored import AnchoredSettings, Effort
 from chsel.methods.cvo import CvoSettings
 from chsel.methods.gradient_descent import DescentSettings
 from chsel.methods.icp import Icp, IcpSettings
-from chsel.methods.medial_constraint import CmaEsSettings, MedialCostSettings
-from chsel.methods.svgd import SvgdSettings
+from chsel.methods.medial_constraint import CmaEsSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.settings import PRESETS, NamedChoices, settings_mapping
-from chsel.qd.selection import OutputSettings
 from tests.chsel.methods.scene import posed
 
 NAN = float("nan")
 REFUSED: list[tuple[type[Any], dict[str, Any], str]] = [
     (AnchoredSettings, {"size": "huge"}, "^size is .*accepted: "),
-    (AnchoredSettings, {"noise": 0.0}, "^noise is "),
     (Effort, {"samples": 10**12}, "^samples is "),
-    (Effort, {"refined": 0}, "^refined is "),
-    (Effort, {"evaluations": NAN}, "^evaluations is "),
-    (AnchorSettings, {"pairs": -0.1}, "^pairs is -0.1"),
-    (AnchoredStarts, {"kept": 10**6}, "^kept is 1000000; "),
     (CmaEsSettings, {"starts": "many"}, "^starts is 'many'; accepted: per_start, single"),
     (CmaEsSettings, {"generations": 20_001}, "^generations is 20001; accepted: at most 20_000"),
     (CostSettings, {"penetration_tolerance": 0.01}, "^penetration_tolerance is 0.01"),
     (CostSettings, {"free_term": "interior", "gradient": "exact"}, "piecewise constant.*accepted"),
-    (CvoSettings, {"ell": 1e-9}, "accepted: 1e-06 to 1000"),
-    (CvoSettings, {"max_step": 2.0}, "^max_step is 2.0; accepted: at most 1"),
     (CvoSettings, {"ell_decay": 1.0}, "accepted: at most 0.99"),
-    (CvoSettings, {"stop_below": -1.0}, "^stop_below is -1.0"),
     (DescentSettings, {"race": []}, r"^race is \[\]; accepted: null, or shares"),
     (DescentSettings, {"race": [0.5, 0.6]}, "^race is .*none above the one before"),
-    (DescentSettings, {"race": [1.0, 0.0]}, "^race is .*above 0"),
-    (DescentSettings, {"race": [1.0, NAN]}, "^race is "),
-    (DescentSettings, {"race": [1.5]}, "^race is .*at most 1"),
-    (IcpSettings, {"surface_points": 10**9}, "^surface_points is "),
-    (IcpSettings, {"stop_below": 1.5}, "^stop_below is 1.5"),
-    (MedialCostSettings, {"inflation": -1.0}, "^inflation is -1"),
     (OnlineSettings, {"rotation_law": "uniform"}, "accepted: axis_gauss, rotvec_gauss"),
-    (OutputSettings, {"margin": NAN}, "^margin is nan; "),
-    (SvgdSettings, {"sharpness": 0.0}, "^sharpness is 0.0"),
-    (SvgdSettings, {"iterations": 10**7}, "^iterations is "),
 ]
 
 
@@ -101,21 +81,6 @@ def test_one_setting_changes_and_nothing_else(name):
         for group in reversed(groups):
             changes = {group: changes}
         assert settings_mapping(build_method(name, changes).settings) == expected, path
-
-
-def test_a_preset_names_what_differs_alone():
-    for name in OURS:
-        if name == "medial_constraint_cma_me":  # of CHSEL's presets; its defaults are its own
-            continue
-        default = settings_mapping(preset_settings(name))
-        for preset, changes in getattr(type(preset_settings(name)), "presets", {}).items():
-            assert preset in PRESETS[1:]
-            for path in _paths(changes):
-                here: Any = changes
-                ours: Any = default
-                for group in path:
-                    here, ours = here[group], ours[group]
-                assert here != ours, f"{name}, {preset}: {path}"
 
 
 def _paths(settings):

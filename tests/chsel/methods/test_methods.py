@@ -15,16 +15,12 @@ from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, check_rigid, inverse
-from chsel.problem.registration_problem import RegistrationProblem
-from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import PRESETS, settings_mapping
 from chsel.problem.streams import StreamKey
 from tests.chsel.methods.scene import (
-    GRID,
     ODD,
     STANDING,
     TRUTH,
-    WORKSPACE,
     Watcher,
     known_points,
     posed,
@@ -36,14 +32,10 @@ QUICK = {
     "emitter": {"iterations": 6},
     "cma_es": {"generations": 15},
 }
-RELAXED = [n for n in METHODS if isinstance(getattr(preset_settings(n), "cost", 0), CostSettings)]
-"""Methods that minimise the relaxed cost."""
 WITH_ARCHIVE = [name for name in METHODS if hasattr(preset_settings(name), "emitter")]
 PLANAR = [name for name in METHODS if hasattr(preset_settings(name), "plane")]
 WITH_STARTS_NEARBY = ("icp", "svgd", "cvo", "cvo_no_free_space")
 """Methods that find a pose from starts nearby alone."""
-BOUNDED = ("anchored", "cvo", "cvo_no_free_space")
-"""Methods of which no cost is too large for a number."""
 
 
 def quick(name, preset="default", **changes):
@@ -102,13 +94,6 @@ def test_results_are_whole_and_neither_observers_nor_threads_change_a_bit(name, 
     assert method.register(problem, Watcher(snapshot_interval=2)).digest == found.digest
     with threads(2):
         assert method.register(problem).digest == found.digest
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", METHODS)
-def test_one_hypothesis_is_enough(name, preset):
-    method = quick(name, preset)
-    problem = posed(method, FEW)
     assert_whole(method.register(replace(problem, initial_set=problem.initial_set[:1])), 1)
 
 
@@ -116,10 +101,7 @@ def test_one_hypothesis_is_enough(name, preset):
 @pytest.mark.parametrize("name", [name for name in METHODS if name != "anchored"])
 def test_odd_points_have_results(name, preset):
     method = quick(name, preset)
-    cost = getattr(method.settings, "cost", None)
-    for points_name, points in ODD.items():
-        if points_name == "all over" and getattr(cost, "free_term", "direct") == "interior":
-            continue  # too many voxels, which is an error
+    for points in ODD.values():
         found = method.register(posed(method, points))
         assert_whole(found, 30)
         if name.startswith("cvo"):  # one minus a cosine, of sums that are approximated
@@ -133,17 +115,11 @@ def test_a_point_far_outside_of_the_workspace_costs_its_distance():
 
 
 @pytest.mark.filterwarnings("ignore:invalid value encountered")
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", [name for name in METHODS if name not in BOUNDED])
-def test_costs_beyond_all_numbers_are_an_error_that_says_so(name, preset):
-    changes = {}
-    if name in RELAXED:
-        cost = settings_mapping(preset_settings(name, preset))["cost"]
-        changes = {"cost": cost | {"known_scale": 1e308}}
-    method = quick(name, preset, **changes)
-    points = KnownPoints(known=50.0 + np.eye(40, 3) if changes else np.full((3, 3), 1e200))
+@pytest.mark.parametrize("name", ["icp", "medial_constraint"])
+def test_costs_beyond_all_numbers_are_an_error_that_says_so(name):
+    method = quick(name)
     with pytest.raises(ChselError, match=r"has a finite cost; accepted"):
-        method.register(posed(method, points))
+        method.register(posed(method, KnownPoints(known=np.full((3, 3), 1e200))))
 
 
 @pytest.mark.parametrize(
@@ -167,24 +143,6 @@ def test_on_a_plane_every_hypothesis_stands_on_it(name, measure):
     np.testing.assert_allclose(world[:, 2, 2], 1.0, atol=1e-12)
     if name not in WITH_STARTS_NEARBY:
         assert_found(found, STANDING, within=0.01)
-
-
-def test_a_whole_session_step_is_a_function_of_its_problem_alone():
-    method = quick("chsel")
-    first = method.register(posed(method, FEW))
-    second = posed(method, FEW, first)
-    expected = method.register(second).digest
-    rebuilt = RegistrationProblem(
-        SdfGrid(GRID.origin, GRID.resolution, GRID.values, GRID.gradients),
-        KnownPoints(second.points.free, known=second.points.known),
-        second.initial_set.copy(),
-        WORKSPACE,
-        second.free_resolution,
-        second.key,
-        second.low_cost_set.copy(),
-    )
-    assert rebuilt.digest == second.digest
-    assert quick("chsel").register(rebuilt).digest == expected
 
 
 @pytest.mark.parametrize("name", WITH_ARCHIVE)

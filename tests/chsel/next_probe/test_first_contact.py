@@ -72,18 +72,6 @@ def test_a_flat_hand_meets_a_ball_at_its_nearest_point(ahead):
     assert not found.contact[0, ~met].any()
 
 
-def test_a_hand_that_passes_beside_the_object_misses_it():
-    edges = RADIUS + np.array([0.01, 0.02]) * [1.0, 1.0]  # half the hand across z and across y
-    near, far = edges - 0.006, edges + 0.002
-    wide_y = np.ptp(apply(along_x([(0.0, 0.0)]).world_from_hand[0], box_hand().vertices), axis=0)[1]
-    edge_y, edge_z = (1, 0) if wide_y > 0.03 else (0, 1)
-    places = [(near[edge_y], 0.0), (far[edge_y], 0.0), (0.0, -near[edge_z]), (0.0, -far[edge_z])]
-    found = first_contacts(
-        ball(), Belief(at((0.0, 0.0, 0.0)), np.ones(1)), along_x(places), box_hand()
-    )
-    assert np.isfinite(found.travel[0]).tolist() == [True, False, True, False]
-
-
 def by_definition(sdf, pose, world_from_hand, hand):
     """The least way over the fine points around the three of the seen points that are met first."""
     surface, front = touched_points(sdf), hand.front
@@ -125,20 +113,6 @@ def test_first_contacts_are_those_of_the_definition():
         way, place = by_definition(sdf, pose, actions.world_from_hand[n], box_hand())
         assert found.travel[0, n] == pytest.approx(way, abs=1e-12)
         np.testing.assert_allclose(found.contact[0, n], place, rtol=0, atol=1e-12)
-
-
-def test_contacts_move_with_pose_and_hand():
-    stream = np.random.default_rng(4)
-    world = compose(random_rotations(stream, 1)[0], np.array([0.1, -0.2, 0.3]))
-    poses = at(*stream.uniform(-0.05, 0.05, (6, 3)).tolist())
-    actions = along_x([(0.0, 0.0), (0.04, 0.03), (-0.05, 0.02)])
-    moved = Actions(world @ actions.world_from_hand, actions.length)
-    weights = np.full(6, 1.0 / 6.0)
-    here = first_contacts(ball(), Belief(poses, weights), actions, box_hand())
-    there = first_contacts(ball(), Belief(poses @ inverse(world), weights), moved, box_hand())
-    assert there.travel == pytest.approx(here.travel, abs=2e-3)
-    expected = apply(world, here.contact.reshape(-1, 3)).reshape(here.contact.shape)
-    assert np.median(np.linalg.norm(there.contact - expected, axis=-1)) < 0.004
 
 
 def test_threads_and_other_actions_change_no_bit(threads):

@@ -223,15 +223,6 @@ def test_the_centre_is_where_every_symmetry_leaves_it():
     np.testing.assert_allclose(object_symmetry(cone).centre, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "vertices", [[[1.0, 2.0, 3.0]] * 3, [[0.0, 2.0, 3.0], [1.0, 2.0, 3.0], [2.0, 2.0, 3.0]]]
-)
-def test_a_mesh_without_an_area_has_no_symmetry(vertices):
-    found = object_symmetry(trimesh.Trimesh(vertices, [[0, 1, 2]], process=False))
-    assert_same_set(found.rotations, np.eye(3)[None])
-    np.testing.assert_allclose(found.centre, [1.0, 2.0, 3.0])
-
-
 @pytest.mark.parametrize(("name", "count"), SCANS.items())
 def test_models_and_scans_have_the_symmetries_of_their_objects(name, count, ycb_directory):
     mesh = load_mesh(ycb_directory / name / "google_16k" / "nontextured.ply")
@@ -240,14 +231,6 @@ def test_models_and_scans_have_the_symmetries_of_their_objects(name, count, ycb_
     assert found.axis is None
     for rotation in found.rotations[1:]:  # half turns
         np.testing.assert_allclose(rotation @ rotation, np.eye(3), atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("name", "count"),
-    [("cracker_box", 4), ("mustard", 2), ("spam_can", 2), ("hammer", 1), ("clamp", 1)],
-)
-def test_our_models_have_the_symmetries_of_the_objects(name, count):
-    assert len(object_symmetry(load_model(name)).rotations) == count
 
 
 @pytest.mark.parametrize(
@@ -301,22 +284,20 @@ def test_the_true_pose_is_found_from_a_guess_some_centimetres_off():
     free = nodes[(np.abs(nodes) > HALF + 0.002).any(axis=1)]
     points = KnownPoints(free=apply(truth, free), known=apply(truth, sides * HALF))
     problem = replace(problem, points=points)
-    shift = compose(
-        rotation_vector(np.array([[0.02, -0.01, 0.015]])), np.array([[0.05, -0.06, 0.03]])
-    )[0]
-    guess = compose((shift @ truth)[None, :3, :3], truth[None, :3, 3] + shift[None, :3, 3])[0]
+    turn, shift = rotation_vector(np.array([0.02, -0.01, 0.015])), np.array([0.05, -0.06, 0.03])
+    guess = compose(turn @ truth[:3, :3], truth[:3, 3] + shift)
     found = find_true_pose(problem, guess, QUICK)
     offset = found.world_from_object[:3, 3] - truth[:3, 3]
     assert np.sqrt((offset**2).sum()) < 0.004
-    turn = found.world_from_object[:3, :3] @ truth[:3, :3].T
-    assert rotation_angle(turn) < rotation_angle(shift[:3, :3])
+    left = found.world_from_object[:3, :3] @ truth[:3, :3].T
+    assert rotation_angle(left) < rotation_angle(turn)
     assert found.cost < 0.1 * found.guess_cost
     cost = EvaluationCost(problem, QUICK.cost)
     assert found.cost == cost.evaluate(inverse(found.world_from_object)[None])[0]
     assert find_true_pose(problem, guess, replace(QUICK, passes=1)).cost >= found.cost
 
 
-def test_every_pass_looks_closer_around_the_best_pose_so_far(monkeypatch):
+def test_every_pass_looks_closer(monkeypatch):
     """Reach becomes a spacing; spacing and angle shrink by their ratio, here to a quarter."""
     problem, truth = scene(np.random.default_rng(3), box(HALF))
     seen: list[PoseGrid] = []
@@ -327,20 +308,17 @@ def test_every_pass_looks_closer_around_the_best_pose_so_far(monkeypatch):
 
     monkeypatch.setattr(pose_scan, "PoseGrid", watched)
     settings = replace(QUICK, reach=0.08, spacing=0.02, rotations=400, angle=0.2, passes=3)
-    best = truth
-    for passes in (1, 2, 3):
-        seen.clear()
-        found = find_true_pose(problem, truth, replace(settings, passes=passes))
-        last, closer = seen[-1], 0.25 ** (passes - 1)
-        offsets = last.offsets.points()
+    best = find_true_pose(problem, truth, replace(settings, passes=2)).world_from_object
+    seen.clear()
+    find_true_pose(problem, truth, settings)
+    np.testing.assert_array_equal(seen[2].centre, best[:3, 3])
+    for grid, closer in zip(seen, (1.0, 0.25, 0.0625), strict=True):
+        offsets = grid.offsets.points()
         assert np.abs(offsets).max() == pytest.approx(0.08 * closer)
         assert np.diff(np.unique(offsets[:, 2]))[0] == pytest.approx(0.02 * closer)
-        np.testing.assert_array_equal(last.centre, best[:3, 3])
-        np.testing.assert_allclose(last.rotations[0], best[:3, :3], atol=1e-12)
-        angles = rotation_angle(last.rotations[1:] @ best[:3, :3].T)
+        angles = rotation_angle(grid.rotations[1:] @ grid.rotations[0].T)
         spread = np.sqrt((angles**2).mean())  # of three normal coordinates
         assert spread == pytest.approx(3.0**0.5 * 0.2 * closer, rel=0.1)
-        best = found.world_from_object
 
 
 def test_a_guess_that_nothing_beats_stays():

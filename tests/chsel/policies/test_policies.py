@@ -28,16 +28,6 @@ def test_only_actions_that_can_be_taken_are_chosen(name):
     assert build_policy(name).decide(nothing).stop == "actions"
 
 
-@pytest.mark.parametrize("name", POLICIES)
-def test_a_decision_is_a_function_of_its_problem(name):
-    problem = ball_problem(TWO, along_x(PLACES))
-    policy = build_policy(name)
-    first = policy.decide(problem)
-    policy.decide(ball_problem(TWO[::-1], along_x(PLACES[::-1]), step=1))
-    assert policy.decide(problem).digest == first.digest
-    assert build_policy(name).decide(ball_problem(TWO, along_x(PLACES))).digest == first.digest
-
-
 @pytest.mark.parametrize(
     ("name", "scores"),
     [

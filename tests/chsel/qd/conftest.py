@@ -13,13 +13,12 @@ from chsel.qd import emitters
 
 @pytest.fixture(scope="module")
 def searches_around():
-    """Compiles the searches, as they are, around other functions instead of those of poses."""
+    """Compiles the searches, as they are, around another cost instead of that of poses."""
     with pytest.MonkeyPatch.context() as patch:
 
-        def around(*functions):
-            for function in functions[1:]:
-                patch.setattr(emitters, function.__name__, function)
-            patch.setattr(emitters, "costs_of", _one_by_one(functions[0]))
+        def around(cost_of, cost_and_gradient_of):
+            patch.setattr(emitters, "cost_and_gradient_of", cost_and_gradient_of)
+            patch.setattr(emitters, "costs_of", _one_by_one(cost_of))
             for name in ("mega_iterations", "me_iterations"):
                 loop: Any = getattr(emitters, name)
                 patch.setattr(emitters, name, numba.njit(error_model="numpy")(loop.py_func))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from chsel.numerics.arrays import digest
-from chsel.problem.registration_problem import NullObserver
+from chsel.numerics.pose_tuples import SpaceConstants
 from chsel.problem.streams import StreamKey
 from chsel.qd import emitters
 from chsel.qd.archive import GridArchive
@@ -22,8 +22,10 @@ from chsel.qd.emitters import (
     mega_search,
 )
 from chsel.qd.measures import VECTOR, Measure, MeasureCode
+from tests.chsel.methods.scene import Watcher
 
-QUADRATIC, FLAT, NAN, INFINITE, NAN_BEYOND, NAN_GRADIENT = range(6)
+QUADRATIC, FLAT, NAN, INFINITE, NAN_BEYOND = range(5)
+PLANAR = SpaceConstants(planar=True)  # whose vectors have four numbers
 MEASURE = Measure(("x", "y"), MeasureCode(VECTOR, 2))
 START = np.array([0.3, -0.2, 0.1, 0.2])
 ITERATIONS, COUNT = 60, 12
@@ -43,7 +45,7 @@ class LandscapeObjective:
     """What the searches ask for in place of chsel.cost.objective.Objective."""
 
     def __init__(self, kind):
-        self.model, self.space_arrays = Landscape(kind), 0
+        self.model, self.space_arrays = Landscape(kind), PLANAR
 
     def work(self):
         return 0
@@ -67,54 +69,24 @@ def cost_of(model, space, vector, work):
 def cost_and_gradient_of(model, space, vector, gradient, work):
     for j in range(4):
         gradient[j] = 0.0 if model.kind == FLAT else 2.0 * (j + 1.0) * vector[j]
-    if model.kind == NAN_GRADIENT:
-        gradient[2] = np.nan
     return cost_of(model, space, vector, work)
-
-
-@numba.njit
-def measures_of(space, measure, vector, out):
-    out[0], out[1] = vector[0], vector[1]
-
-
-@numba.njit
-def measure_gradients_of(space, measure, vector, out):
-    out[:] = 0.0
-    out[0, 0] = out[1, 1] = 1.0
 
 
 @pytest.fixture(scope="module", autouse=True)
 def searches_of_a_landscape(searches_around):
-    searches_around(cost_of, cost_and_gradient_of, measures_of, measure_gradients_of)
-
-
-class Watcher(NullObserver):
-    """Wants snapshots at an interval."""
-
-    def __init__(self, interval):
-        self.snapshot_interval = interval
-        self.heard: list[tuple[str, int]] = []
-
-    def trace(self, stage, iteration, vectors, cost):
-        self.heard.append(("trace", iteration))
-
-    def progress(self, stage, iteration, total):
-        self.heard.append((stage, iteration))
-
-    def snapshot(self, archive):
-        self.heard.append(("snapshot", archive.iteration))
+    searches_around(cost_of, cost_and_gradient_of)
 
 
 def empty_archive():
     return GridArchive(MEASURE, np.full(2, -0.5), np.full(2, 0.5), bins=8, dimension=4)
 
 
-def found(name, kind, interval=0, count=COUNT):
+def found(name, kind, interval=0):
     """The archive after a search."""
     archive = empty_archive()
     objective: Any = LandscapeObjective(kind)
-    observer = Watcher(interval) if interval else NullObserver()
-    fill_archive(name, objective, archive, START, count, SETTINGS, StreamKey(4, 0), observer)
+    observer = Watcher(snapshot_interval=interval)
+    fill_archive(name, objective, archive, START, COUNT, SETTINGS, StreamKey(4, 0), observer)
     return archive
 
 
@@ -135,7 +107,7 @@ class Stepper:
         self.elites = random.random(ITERATIONS)
 
     def step(self, kind):
-        landscape = emitters.Landscape(Landscape(kind), 0, MEASURE.code, 0)
+        landscape = emitters.Landscape(Landscape(kind), PLANAR, MEASURE.code, 0)
         random, span = (self._normals, self.elites), (self.iteration, self.iteration + 1)
         self._loop(landscape, self.archive.cells, self.search, *random, *span)
         self.iteration += 1
@@ -167,16 +139,6 @@ def test_iterations_between_calls_change_no_byte(name):
     assert len({bytes_of(found(name, QUADRATIC, interval)) for interval in (0, 1, 7, 25)}) == 1
 
 
-@pytest.mark.parametrize("total", [0, 16])
-def test_an_observer_hears_every_ten_iterations_and_at_its_interval(total):
-    watcher, objective, settings = Watcher(7), LandscapeObjective(QUADRATIC), EmitterSettings(total)
-    key, archive = StreamKey(4, 0), empty_archive()
-    fill_archive("cma_me", objective, archive, START, COUNT, settings, key, watcher)
-    expected = [("snapshot", 7), ("trace", 10), ("cma_me", 10), ("snapshot", 14)]
-    expected += [("trace", 16), ("cma_me", 16), ("snapshot", 16)]
-    assert watcher.heard == [("trace", 0), ("snapshot", 0), *(expected if total else [])]
-
-
 @pytest.mark.parametrize("name", SEARCHES)
 @pytest.mark.parametrize("kind", [NAN, INFINITE])
 def test_costs_that_are_not_finite_leave_the_archive_empty(name, kind):
@@ -189,14 +151,6 @@ def test_a_search_lives_with_costs_of_which_some_are_nan(name):
     assert len(archive.occupied) > 20
     assert np.isfinite(archive.costs).all()
     assert (np.abs(archive.solutions[:, 3]) <= 0.25).all()
-
-
-def test_a_gradient_of_nan_is_no_direction():
-    archive = found("cma_mega", NAN_GRADIENT)
-    assert np.isfinite(archive.solutions).all()
-    assert len(archive.occupied) > 20
-    # Branches leave theta along the measures alone.
-    assert (archive.solutions[:, 2:] == START[2:]).all()
 
 
 @pytest.mark.parametrize("name", SEARCHES)
@@ -221,30 +175,12 @@ def test_without_improvement_it_restarts_from_the_chosen_elite(name):
 
 
 @pytest.mark.parametrize("name", SEARCHES)
-@pytest.mark.parametrize("degenerate", ["covariance", "step"])
-def test_a_degenerate_strategy_restarts_although_it_improved(name, degenerate):
+def test_a_tiny_step_restarts_a_search_although_it_improved(name):
     stepper = Stepper(name)
-    strategy = stepper.search.strategy
-    if degenerate == "covariance":
-        strategy.eigenvalues[0] = 1e-20
-    else:
-        strategy.sigma[0] = 1e-13
+    stepper.search.strategy.sigma[0] = 1e-13
     stepper.step(QUADRATIC)
     assert len(stepper.archive.occupied) > 0
-    assert strategy.evaluations[0] == 0
-    assert strategy.sigma[0] == 0.2
-    assert (stepper.archive.solutions == center(stepper.search)).all(axis=1).any()
-
-
-@pytest.mark.parametrize("name", SEARCHES)
-def test_vectors_that_are_not_finite_are_not_evaluated(name):
-    stepper = Stepper(name)
-    stepper.step(QUADRATIC)
-    stepper.search.strategy.sigma[0] = np.inf
-    stepper.step(QUADRATIC)  # a landscape raises where it is asked for such a vector
     assert stepper.search.strategy.sigma[0] == 0.2
-    assert np.isfinite(center(stepper.search)).all()
-    assert np.isfinite(stepper.archive.solutions).all()
 
 
 @pytest.mark.parametrize("name", SEARCHES)
@@ -256,32 +192,3 @@ def test_on_a_flat_cost_it_restarts_as_soon_as_all_rank_alike(name):
         restarts += int(stepper.search.strategy.evaluations[0] == 0)
     assert restarts > 5
     np.testing.assert_array_equal(stepper.archive.costs, 1.0)
-
-
-def test_theta_moves_by_adam_towards_the_weighted_mean_of_the_parents():
-    stepper = Stepper("cma_mega")
-    theta, first, second = START, np.zeros(4), np.zeros(4)
-    for t in range(1, 4):
-        stepper.step(QUADRATIC)
-        branches = stepper.search.branches
-        parents = int((branches.status > 0).sum())
-        assert parents > 1
-        raw = np.log(parents + 0.5) - np.log(np.arange(parents) + 1.0)
-        best = branches.vectors[branches.order[:parents]]
-        towards = (raw / raw.sum()) @ best - theta
-        first = 0.9 * first + 0.1 * towards
-        second = 0.999 * second + 0.001 * towards**2
-        corrected = np.sqrt(second / (1.0 - 0.999**t)) + 1e-8
-        theta = theta + 0.05 * first / (1.0 - 0.9**t) / corrected
-        np.testing.assert_allclose(stepper.search.theta, theta, rtol=1e-12, atol=1e-15)
-
-
-def test_branches_leave_theta_along_normalised_gradients():
-    stepper = Stepper("cma_mega")
-    stepper.step(QUADRATIC)
-    search = stepper.search
-    downhill = -2.0 * (np.arange(4) + 1.0) * START
-    rows = [downhill / np.sqrt(downhill @ downhill), [1, 0, 0, 0], [0, 1, 0, 0]]
-    np.testing.assert_allclose(search.directions, rows, atol=1e-7)
-    expected = START + search.coefficients @ search.directions
-    np.testing.assert_allclose(search.branches.vectors, expected, rtol=1e-14)

@@ -147,9 +147,6 @@ def test_it_stops_at_a_degenerate_covariance_a_tiny_step_or_a_flat_ranking():
     assert stopped(strategy, order, status, flat)
     assert not stopped(strategy, order, np.array([2, 1, 1, 1]), flat)
     assert not stopped(strategy, order, status, np.array([0.0, 0.0, 0.0, -np.inf]))
-
-
-def test_a_ranking_of_one_is_never_flat():
     assert not stopped(*strategy_and_ranking(1))
 
 

@@ -11,6 +11,7 @@ import pytest
 
 import chsel.qd.emitters
 from chsel.numerics.arrays import FloatArray
+from chsel.numerics.pose_tuples import SpaceConstants
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd.archive import GridArchive
@@ -38,7 +39,7 @@ class Quadratic:
 
     def __init__(self):
         self.model = Parameters(np.linspace(-0.3, 0.3, 9), np.linspace(1.0, 3.0, 9))
-        self.space_arrays = 0
+        self.space_arrays = SpaceConstants()
 
     def work(self):
         return 0
@@ -65,20 +66,9 @@ def cost_and_gradient_of(model, space, vector, gradient, work):
     return cost_of(model, space, vector, work)
 
 
-@numba.njit
-def measures_of(space, measure, vector, out):
-    out[0], out[1] = vector[6], vector[7]
-
-
-@numba.njit
-def measure_gradients_of(space, measure, vector, out):
-    out[:] = 0.0
-    out[0, 6] = out[1, 7] = 1.0
-
-
 @pytest.fixture(scope="module", autouse=True)
 def searches_of_the_quadratic(searches_around):
-    searches_around(cost_of, cost_and_gradient_of, measures_of, measure_gradients_of)
+    searches_around(cost_of, cost_and_gradient_of)
 
 
 MEASURE = Measure(("x", "y"), MeasureCode(VECTOR, 2, 6))
