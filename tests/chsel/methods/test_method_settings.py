@@ -21,7 +21,6 @@ from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.settings import PRESETS, NamedChoices, settings_mapping
 from tests.chsel.methods.scene import posed
 
-NAN = float("nan")
 REFUSED: list[tuple[type[Any], dict[str, Any], str]] = [
     (AnchoredSettings, {"size": "huge"}, "^size is .*accepted: "),
     (Effort, {"samples": 10**12}, "^samples is "),

@@ -15,7 +15,6 @@ from chsel.numerics.threads import threads
 from chsel.plausible import pose_scan
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import (
-    PlausibleSet,
     load_plausible,
     plausible_path,
     plausible_set,
@@ -33,7 +32,6 @@ from chsel.plausible.plausible_settings import (
 from chsel.plausible.pose_scan import grid_around, scan_grid
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, compose, inverse, rotation_angle
-from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import StreamKey
 from tests.chsel.plausible.scenes import OBJECTS, ball, box, scene
 
@@ -260,7 +258,6 @@ SETTINGS = PlausibleSettings(
     grid=PoseGridSettings(Offsets(((-0.02, 0.02, 3),), ((0.0, 0.0, 1),), ((0.0, 0.0, 1),)), 20),
     modes=ModeSearchSettings(starts=5),
 )
-Made = tuple[RegistrationProblem, FloatArray, PlausibleSet]
 
 
 @pytest.fixture(scope="module")

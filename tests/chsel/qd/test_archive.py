@@ -85,7 +85,6 @@ def test_angles_across_half_a_turn_stay_neighbours():
 
 
 BINS, LOWER, UPPER = 4, -1.0, 1.0
-Solution = tuple[tuple[float, ...], float]
 
 
 class PlainArchive:
