@@ -15,9 +15,9 @@ import numpy as np
 
 from chsel.cost.free_kernels import FreeTerm, Neighbours, free_sums, neighbours_of, slope
 from chsel.numerics.arrays import FloatArray, scratch
-from chsel.numerics.cell_set import placed
+from chsel.numerics.cell_set import node_of
 from chsel.numerics.compiler import compiled, inner, leaf
-from chsel.numerics.pose_tuples import finite, moved, pose_at
+from chsel.numerics.pose_tuples import finite, pose_at
 from chsel.problem.sdf_lookup import DistanceField, at_node, distance_between_nodes
 
 LANES = 8
@@ -216,12 +216,26 @@ def _read(field, lanes, x, y, z):
 
 @leaf
 def _locate(box, lanes, x, y, z):
+    first, last, most, inverse = box.first, box.last, box.most, box.inverse
     for at in range(LANES):
-        cell, u, v, w, a, b, c = placed(box, *moved(_twelve(lanes, at), x, y, z))
+        a = lanes[at] * x + lanes[LANES + at] * y + lanes[2 * LANES + at] * z
+        b = lanes[3 * LANES + at] * x + lanes[4 * LANES + at] * y + lanes[5 * LANES + at] * z
+        c = lanes[6 * LANES + at] * x + lanes[7 * LANES + at] * y + lanes[8 * LANES + at] * z
+        a, b = a + lanes[9 * LANES + at], b + lanes[10 * LANES + at]
+        c = c + lanes[11 * LANES + at]
+        d = min(max(first[0], a), last[0])  # in this order, NaN ends up in the box
+        e = min(max(first[1], b), last[1])
+        f = min(max(first[2], c), last[2])
+        a, b, c = a - d, b - e, c - f
         lanes[_BEYOND + at] = a * a + b * b + c * c
         lanes[_AWAY + at], lanes[_AWAY + LANES + at], lanes[_AWAY + 2 * LANES + at] = a, b, c
-        lanes[_PLACE + at], lanes[_PLACE + LANES + at], lanes[_PLACE + 2 * LANES + at] = u, v, w
-        lanes[_CELL + at] = cell
+        a, b, c = (d - first[0]) * inverse, (e - first[1]) * inverse, (f - first[2]) * inverse
+        d = node_of(a, box.between, most[0])
+        e = node_of(b, box.between, most[1])
+        f = node_of(c, box.between, most[2])
+        lanes[_PLACE + at], lanes[_PLACE + LANES + at] = a - d, b - e
+        lanes[_PLACE + 2 * LANES + at] = c - f
+        lanes[_CELL + at] = d * box.across + e * box.along + f
 
 
 @leaf

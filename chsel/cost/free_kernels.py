@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray, scratch
-from chsel.numerics.cell_set import CellSet, placed
+from chsel.numerics.cell_set import CellSet, node_of
 from chsel.numerics.compiler import inner, leaf, spliced
 from chsel.numerics.near_points import (
     NearPoints,
@@ -17,7 +17,7 @@ from chsel.numerics.near_points import (
     select,
     to_cells,
 )
-from chsel.numerics.pose_tuples import Pose, Triple, inverted, moved, rigid, turned_back
+from chsel.numerics.pose_tuples import Pose, Triple, inverted, rigid, turned_back
 from chsel.problem.sdf_lookup import at_node
 
 MOST_SLACK = 0.03  # metres, in a descent
@@ -231,12 +231,24 @@ def _put(block, first, n, four):
 @inner
 def _locate(move, box, level, block, count):
     """Where the points lie, once moved."""
+    first, last, most, inverse = box.first, box.last, box.most, box.inverse
     for n in range(count):
         x, y, z = block[_POINT + n], block[_POINT + _MOST + n], block[_POINT + 2 * _MOST + n]
-        cell, u, v, w, a, b, c = placed(box, *moved(move, x, y, z))
-        block[_LEVEL + n] = level if a * a + b * b + c * c == 0.0 else -np.inf
-        block[_PLACE + n], block[_PLACE + _MOST + n], block[_PLACE + 2 * _MOST + n] = u, v, w
-        block[_CELL + n] = cell
+        a = move[0] * x + move[1] * y + move[2] * z + move[9]
+        b = move[3] * x + move[4] * y + move[5] * z + move[10]
+        c = move[6] * x + move[7] * y + move[8] * z + move[11]
+        d = min(max(first[0], a), last[0])  # in this order, NaN ends up in the box
+        e = min(max(first[1], b), last[1])
+        f = min(max(first[2], c), last[2])
+        beyond = (a - d) * (a - d) + (b - e) * (b - e) + (c - f) * (c - f)
+        block[_LEVEL + n] = level if beyond == 0.0 else -np.inf
+        a, b, c = (d - first[0]) * inverse, (e - first[1]) * inverse, (f - first[2]) * inverse
+        d = node_of(a, box.between, most[0])
+        e = node_of(b, box.between, most[1])
+        f = node_of(c, box.between, most[2])
+        block[_PLACE + n], block[_PLACE + _MOST + n] = a - d, b - e
+        block[_PLACE + 2 * _MOST + n] = c - f
+        block[_CELL + n] = d * box.across + e * box.along + f
 
 
 @inner

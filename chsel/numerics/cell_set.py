@@ -9,7 +9,6 @@ import numpy as np
 
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, read_only
 from chsel.numerics.compiler import compiled, inner, leaf
-from chsel.numerics.pose_tuples import moved
 
 _FAR = 2**60
 _MOST_STEPS = 225  # squared sides of a cell: 15, the greatest that a byte holds squared
@@ -159,29 +158,23 @@ def places_for(size: int) -> Places:
 @inner
 def locate(move, box, x, y, z, places, count):
     """Fill the places of the first `count` points x, y, z moved by `move`; vectorised."""
+    first, last, most, inverse = box.first, box.last, box.most, box.inverse
     beyond, cell = places.beyond, places.cell
     u, v, w = places.u, places.v, places.w
     for n in range(count):
-        at, u[n], v[n], w[n], a, b, c = placed(box, *moved(move, x[n], y[n], z[n]))
-        beyond[n] = a * a + b * b + c * c
-        cell[n] = np.int32(at)
-
-
-@leaf
-def placed(box, x, y, z):
-    """The flat index of a point's cell, the place from its node, in cells, and from the box.
-
-    Of the nearest point of the box, whose way to the point is the last three numbers.
-    """
-    first, last, most, inverse = box.first, box.last, box.most, box.inverse
-    a = min(max(first[0], x), last[0])  # in this order, NaN ends up in the box
-    b = min(max(first[1], y), last[1])
-    c = min(max(first[2], z), last[2])
-    u, v, w = (a - first[0]) * inverse, (b - first[1]) * inverse, (c - first[2]) * inverse
-    i = node_of(u, box.between, most[0])
-    j = node_of(v, box.between, most[1])
-    k = node_of(w, box.between, most[2])
-    return i * box.across + j * box.along + k, u - i, v - j, w - k, x - a, y - b, z - c
+        a = move[0] * x[n] + move[1] * y[n] + move[2] * z[n] + move[9]
+        b = move[3] * x[n] + move[4] * y[n] + move[5] * z[n] + move[10]
+        c = move[6] * x[n] + move[7] * y[n] + move[8] * z[n] + move[11]
+        d = min(max(first[0], a), last[0])  # in this order, NaN ends up in the box
+        e = min(max(first[1], b), last[1])
+        f = min(max(first[2], c), last[2])
+        beyond[n] = (a - d) * (a - d) + (b - e) * (b - e) + (c - f) * (c - f)
+        a, b, c = (d - first[0]) * inverse, (e - first[1]) * inverse, (f - first[2]) * inverse
+        d = node_of(a, box.between, most[0])
+        e = node_of(b, box.between, most[1])
+        f = node_of(c, box.between, most[2])
+        u[n], v[n], w[n] = a - d, b - e, c - f
+        cell[n] = np.int32(d * box.across + e * box.along + f)
 
 
 @leaf
