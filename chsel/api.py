@@ -14,12 +14,19 @@ import numpy as np
 from chsel.errors import MeshError, PointsError, PointsWarning, quoted, require_instance
 from chsel.methods import build_method, default_method, noise_of, preset_settings, trust_by
 from chsel.numerics.arrays import frozen
-from chsel.problem.defaults import FREE_RESOLUTION, object_grid, workspace_around
 from chsel.problem.mesh import clean_mesh
 from chsel.problem.online_registration import OnlineRegistration
-from chsel.problem.points import KnownPoints, Workspace, check_contacts, check_points, require_parts
+from chsel.problem.points import (
+    FREE_RESOLUTION,
+    KnownPoints,
+    Workspace,
+    check_contacts,
+    check_points,
+    require_parts,
+    workspace_around,
+)
 from chsel.problem.registration_problem import Hypotheses, Observer
-from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.sdf_grid import SdfGrid, object_grid
 from chsel.problem.settings import changed_settings
 from chsel.problem.trust import check_trust
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from chsel.errors import ChselError, RecordingError
-from chsel.problem.file_checks import refuse_special_file
+from chsel.numerics.arrays import refuse_special_file
 
 _DIGEST_SIZE = 16  # bytes
 

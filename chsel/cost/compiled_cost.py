@@ -101,7 +101,13 @@ def _free_term(
 ) -> FreeTerm:
     is_interior = settings.free_term == "interior" and len(free) > 0
     if is_interior:
-        tree, interior = sdf.derived(("interior", settings), lambda: _interior_tree(sdf, settings))
+
+        def make() -> tuple[PointTree, InteriorPoints]:
+            found = interior_points(sdf, settings)
+            tree = point_tree(found.points, found.spacing)
+            return tree, found.in_order(tree.order)
+
+        tree, interior = sdf.derived(("interior", settings), make)
         weights = interior.weights(settings, free_resolution)[:, None]
         weights = np.concatenate([weights, -weights * interior.normals], axis=1).reshape(-1)
         voxels = VoxelGrid.around(free, free_resolution)
@@ -131,13 +137,6 @@ def _free_term(
         lower=lower,
         upper=upper,
     )
-
-
-def _interior_tree(sdf: SdfGrid, settings: CostSettings) -> tuple[PointTree, InteriorPoints]:
-    """The interior points of the object as a tree, and in the order of the tree."""
-    interior = interior_points(sdf, settings)
-    tree = point_tree(interior.points, interior.spacing)
-    return tree, interior.in_order(tree.order)
 
 
 def _sphere_around_cells(sdf: SdfGrid, level: float, lookup: str) -> tuple[Triple, float]:

@@ -101,21 +101,13 @@ def free_sums(model, pose, near, n, most_slack):
         count = total
     else:
         slack = _slack_to_gather(free, pose, near, n, most_slack)
-        if slack >= 0.0:
-            _gather_within(free, pose, near, n, to_cell, slack, rounding)
+        if slack >= 0.0 and is_apart(free, pose, slack + rounding):
+            points.number[n] = 0
+        elif slack >= 0.0:
+            gather(free.tree, free.cells, to_cell, slack + rounding, points, n)
         if points.number[n] > 0:
             count = select(free.tree, free.cells, to_cell, rounding, points, n)
     return _sums_over(model, pose, move, points.hits, count, near.block)
-
-
-@leaf
-def _gather_within(free, pose, near, n, to_cell, slack, rounding):
-    """Gather the points that can matter until the object has moved by `slack` metres."""
-    points, reach = near.points, slack + rounding
-    if is_apart(free, pose, reach):
-        points.number[n] = 0
-    else:
-        gather(free.tree, free.cells, to_cell, reach, points, n)
 
 
 @leaf

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 
 try:
@@ -56,12 +54,6 @@ class RelaxedCost:
         corners = (deep.min(axis=0) - 1, deep.max(axis=0) + 1) if len(deep) else (1, 0)
         # Free points outside of this box cost nothing.
         self._deep = [_tensor(sdf.origin + sdf.resolution * np.asarray(c)) for c in corners]
-        if len(points.free) and not len(deep):
-            warnings.warn(
-                f"no node of the SDF is deeper than {-settings.alpha} m: free points cannot be "
-                "violated; use a smaller penetration_tolerance",
-                stacklevel=2,
-            )
 
     @classmethod
     def of(cls, problem: RegistrationProblem, settings: CostSettings | None = None) -> RelaxedCost:

@@ -10,11 +10,10 @@ import numpy as np
 
 from chsel.errors import SettingError
 from chsel.next_probe.decision_problem import Actions, HandShape
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray, evenly_spaced
 from chsel.problem.points import Workspace
 from chsel.problem.poses import compose, rotated
 from chsel.problem.settings import CheckedSettings, at_most, not_negative, one_of, positive
-from chsel.problem.subset import evenly_spaced
 
 FLOOR = 0.0  # height of the floor that the object lies on, metres
 CLEARANCE = 0.005  # metres: no part of the hand comes nearer to the floor

@@ -11,25 +11,24 @@ import numpy as np
 
 from chsel.next_probe.decision_problem import Belief, Decision, DecisionProblem
 from chsel.next_probe.first_contact import FirstContacts, first_contacts
-from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.numerics.arrays import BoolArray, FloatArray, evenly_spaced
 from chsel.numerics.compiler import compiled
 from chsel.numerics.elementary import exp, exps, log, logs
 from chsel.numerics.threads import parallel_for
-from chsel.problem.outline import (
-    in_order,
-    outline_distances,
-    outline_in_world,
-    signed_distances,
-    surface_spread,
-)
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import Poses, compose, inverse, random_rotations, rotated
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import CheckedSettings, at_most, not_negative, positive
 from chsel.problem.streams import Purpose, StreamKey, uniforms
-from chsel.problem.subset import evenly_spaced
-from chsel.problem.surface import object_centre
+from chsel.problem.surface import (
+    in_order,
+    object_centre,
+    outline_distances,
+    outline_in_world,
+    signed_distances,
+    surface_spread,
+)
 
 MOST_POSES = 2000
 _DRAWN = 1000  # poses before any registration, of which those that free space allows are kept

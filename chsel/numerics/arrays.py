@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import sys
+import zipfile
+from collections.abc import Collection
 from dataclasses import fields
+from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chsel.errors import ChselError, PointsError
+from chsel.errors import ChselError, PointsError, quoted
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -83,6 +88,11 @@ def scratch(*shape: int, dtype: Any = np.float64) -> NDArray[Any]:
     return memory[first : first + size].view(dtype).reshape(shape)
 
 
+def evenly_spaced(size: int, count: int) -> IntArray:
+    """At most `count` of the numbers below size, evenly spaced, beginning with 0."""
+    return np.arange(size) if size <= count else np.arange(count) * size // count
+
+
 def digest(*arrays: NDArray[Any]) -> str:
     """BLAKE2b (128 bit, hexadecimal) of the types, shapes and bytes of arrays, in order."""
     state = hashlib.blake2b(digest_size=16)
@@ -96,3 +106,52 @@ def digest(*arrays: NDArray[Any]) -> str:
 
 def _show(shape: tuple[int | None, ...]) -> str:
     return "(" + ", ".join("any" if length is None else str(length) for length in shape) + ")"
+
+
+MOST_BYTES = 512 * 2**20  # of the arrays of an .npz file, unpacked: 16 million points with steps
+
+
+def refuse_special_file(name: str, path: Path, error: type[ChselError]) -> None:
+    """Raise `error` if `path` is a FIFO, a socket or a device, or a link to one.
+
+    name: of the file in the message, such as "recording a.mcap". Other paths pass, also those that
+    do not exist or cannot be opened.
+    """
+    if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
+        raise error(f"{name} is a FIFO, a socket or a device; accepted: a file")
+
+
+def read_npz(
+    path: Path,
+    *,
+    accepted: Collection[str] | None = None,
+    most_bytes: int = MOST_BYTES,
+    error: type[ChselError],
+) -> dict[str, np.ndarray[Any, Any]]:
+    """The arrays by name; every checksum is compared, and no pickled object is loaded.
+
+    accepted: names that the arrays may have (None: any). most_bytes: limit of all arrays, unpacked.
+    Raises `error` with a message of one line for any defect of the file.
+    """
+    refuse_special_file("it", path, error)
+    arrays: dict[str, np.ndarray[Any, Any]] = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+            if size > most_bytes:
+                raise error(
+                    f"its arrays have {size / 2**20:.0f} MiB unpacked; "
+                    f"accepted: at most {most_bytes // 2**20} MiB"
+                )
+            for member in archive.namelist():
+                name = member.removesuffix(".npy")
+                if accepted is not None and name not in accepted:
+                    raise error(f"array {quoted(name)} is unknown; accepted: {', '.join(accepted)}")
+                data = BytesIO(archive.read(member))  # to its end, where the checksum is compared
+                arrays[name] = np.lib.format.read_array(data, allow_pickle=False)
+    except ChselError:
+        raise
+    except Exception as problem:  # zipfile, its decompressors and numpy raise many kinds
+        reason = " ".join(str(problem).split()) or type(problem).__name__
+        raise error(f"not a readable .npz file ({reason[:200]})") from None
+    return arrays

@@ -21,7 +21,7 @@ from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.objective import Objective
 from chsel.errors import ChselError, EvaluationError, PoseError
-from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, digest, frozen
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, digest, frozen, read_npz
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.plausible.pose_scan import (
@@ -32,7 +32,6 @@ from chsel.plausible.pose_scan import (
     scan_grid,
 )
 from chsel.plausible.surface_distance import SQUARE_MILLIMETRES, DistanceSettings, SurfaceDistance
-from chsel.problem.file_checks import read_npz
 from chsel.problem.poses import Poses, check_rigid, compose, inverse, product, rotation_vector
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid

@@ -11,10 +11,10 @@ from chsel.errors import EvaluationError, SettingError
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.plausible.surface_distance import SurfaceDistance
 from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry
-from chsel.problem.outline import outline_distances_to
 from chsel.problem.poses import Poses, inverse, product, rotated
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.sdf_grid import FARTHEST, SdfGrid
+from chsel.problem.surface import outline_distances_to
 
 
 def pose_errors(

@@ -12,11 +12,10 @@ from chsel.next_probe.forecast import Forecast
 from chsel.numerics.arrays import FloatArray
 from chsel.policies.policy import ConfiguredPolicy, Policy, PolicySettings
 from chsel.policies.voxel_entropy import VoxelEntropy, VoxelEntropySettings
-from chsel.problem.outline import in_order
 from chsel.problem.poses import Poses, rotated
 from chsel.problem.settings import Entry, NamedChoices
 from chsel.problem.streams import Purpose, uniforms
-from chsel.problem.surface import object_centre
+from chsel.problem.surface import in_order, object_centre
 
 
 def grid(problem: DecisionProblem, forecast: Forecast) -> FloatArray:

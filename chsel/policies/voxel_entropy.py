@@ -15,7 +15,7 @@ from scipy.ndimage import maximum_filter
 from chsel.next_probe.decision_problem import DecisionProblem, HandFront
 from chsel.next_probe.first_contact import moves_by_orientation, touched_points
 from chsel.next_probe.forecast import Forecast
-from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.arrays import FloatArray, IntArray, evenly_spaced
 from chsel.numerics.compiler import compiled
 from chsel.numerics.elementary import logs
 from chsel.policies.policy import ConfiguredPolicy, PolicySettings
@@ -23,7 +23,6 @@ from chsel.problem.points import Workspace
 from chsel.problem.poses import Poses, rotated
 from chsel.problem.sdf_grid import FARTHEST, SdfGrid
 from chsel.problem.settings import positive
-from chsel.problem.subset import evenly_spaced
 
 _MOST_VOXELS = 1_000_000
 _MOST_POINTS = 5000  # inside of an object

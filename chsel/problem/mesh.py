@@ -9,17 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from chsel.errors import MeshError, MeshWarning, require_positive
-from chsel.numerics.arrays import digest, frozen
-from chsel.problem.file_checks import refuse_special_file
+from chsel.numerics.arrays import digest, frozen, refuse_special_file
 
 if TYPE_CHECKING:
     import trimesh
 
 SMALLEST = 0.005  # metres; objects that a gripper probes have a larger extent
 LARGEST = 10.0  # metres; a larger extent is probably in millimetres
-MANY_FACES = 200_000  # a mesh of more is slow
-ENOUGH_FACES = 50_000  # of an object of the size of a hand: sides of 1 mm
-_SECONDS_PER_FACE = 1.5e-5  # on one core: merging vertices, and a grid of 60 000 nodes
 _NEAR = 0.5  # largest gap between the bodies of one object, in diameters of the largest body
 _MOST_BODIES = 1000  # that are compared, the largest ones
 
@@ -61,7 +57,7 @@ def clean_mesh(
     """A checked mesh in metres: equal vertices merged, faces turned outward, float64.
 
     vertices (V, 3): in units of `scale` metres. faces (F, 3): indices of vertices. Warns about
-    meshes that are open after merging, have bodies far apart, or have more than MANY_FACES faces.
+    meshes that are open after merging, or have bodies far apart.
     Raises MeshError if there are no faces, a number is not finite, an index has no vertex, the mesh
     is flat, or its size in metres is not that of an object.
     """
@@ -78,13 +74,6 @@ def clean_mesh(
         raise MeshError(
             f"{name}: faces[{row}] is {faces[row].tolist()}; "
             f"accepted: indices of its {len(vertices)} vertices"
-        )
-    if len(faces) > MANY_FACES:
-        seconds = len(faces) * _SECONDS_PER_FACE
-        warnings.warn(
-            f"{name} has {len(faces):,} faces: making its signed distance grid takes "
-            f"{seconds:.0f} s or more; a decimated mesh of {ENOUGH_FACES:,} faces is as good",
-            stacklevel=2,
         )
     _check_size(name, np.ptp(vertices[np.unique(faces)], axis=0) * scale)
 

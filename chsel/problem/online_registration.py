@@ -54,33 +54,6 @@ class OnlineSettings(CheckedSettings):
     }
 
 
-def pose_problem(
-    sdf: SdfGrid,
-    points: KnownPoints,
-    workspace: Workspace,
-    free_resolution: float,
-    key: StreamKey,
-    settings: OnlineSettings,
-    previous: Hypotheses | None,
-) -> RegistrationProblem:
-    """The next registration of a session, given the result of the previous one if there is any."""
-    if previous is None:
-        initial_set = first_initial_set(workspace, points, key, settings)
-        low_cost_set = np.zeros((0, 4, 4))
-    else:
-        low_cost_set = {
-            "elites": previous.elites,
-            "estimates": previous.object_from_world,
-            "none": np.zeros((0, 4, 4)),
-        }[settings.low_cost_set]
-        initial_set = previous.object_from_world[: settings.hypotheses]
-        if settings.update == "noise":
-            initial_set = updated_initial_set(previous, key, settings)
-    return RegistrationProblem(
-        sdf, points, initial_set, workspace, free_resolution, key, low_cost_set
-    )
-
-
 def first_initial_set(
     workspace: Workspace, points: KnownPoints, key: StreamKey, settings: OnlineSettings
 ) -> FloatArray:
@@ -230,15 +203,21 @@ class OnlineRegistration:
         Raises PoseError if that result has no poses or some that are not finite, and SettingError
         if no point is known.
         """
-        return pose_problem(
-            self.sdf,
-            self.points,
-            self._workspace,
-            self._free_resolution,
-            StreamKey(self._seed, step),
-            replace(self._settings, hypotheses=self._larger * self._settings.hypotheses),
-            self.previous,
-        )
+        key = StreamKey(self._seed, step)
+        settings = replace(self._settings, hypotheses=self._larger * self._settings.hypotheses)
+        low_cost_set = np.zeros((0, 4, 4))
+        if self.previous is None:
+            initial_set = first_initial_set(self._workspace, self.points, key, settings)
+        else:
+            initial_set = self.previous.object_from_world[: settings.hypotheses]
+            if settings.update == "noise":
+                initial_set = updated_initial_set(self.previous, key, settings)
+            if settings.low_cost_set == "elites":
+                low_cost_set = self.previous.elites
+            elif settings.low_cost_set == "estimates":
+                low_cost_set = self.previous.object_from_world
+        around = self._workspace, self._free_resolution
+        return RegistrationProblem(self.sdf, self.points, initial_set, *around, key, low_cost_set)
 
     def start_afresh(self, larger: int = 1) -> None:
         """Let the next problem be a first one, with so many times the hypotheses."""

@@ -28,6 +28,8 @@ from chsel.numerics.arrays import (
 from chsel.numerics.cell_set import bounds_of, set_voxels
 from chsel.problem.sdf_grid import SdfGrid
 
+FREE_RESOLUTION = 0.01  # side of a voxel of free space, metres
+
 # In diameters of the object:
 MOST_APART = 10.0  # between contacts, and from a contact to the free points
 NEVER_APART = 100.0  # between contacts: a tenth of an object whose points are in millimetres
@@ -131,6 +133,11 @@ class Workspace:
         """The bounds of points (N, 3), N > 0, padded by `margin` on every side."""
         lower, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
         return cls(tuple(lower.tolist()), tuple(upper.tolist()))
+
+
+def workspace_around(points: KnownPoints, sdf: SdfGrid) -> Workspace:
+    """Where an object can be that touches some of the points: their bounds and its diameter."""
+    return Workspace.around(points.all_points(), sdf.diameter)
 
 
 @dataclass(frozen=True)

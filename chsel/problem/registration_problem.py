@@ -177,27 +177,21 @@ class Observer(Protocol):
 
     def progress(self, stage: str, iteration: int, total: int) -> None:
         """A stage has finished `iteration` of `total` iterations."""
+        return
 
     def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
         """State of a stage at its start and after blocks of iterations.
 
         vectors (B, d): of the search; in quality-diversity search, of all elites. cost (B,).
         """
+        return
 
     def snapshot(self, archive: ArchiveSnapshot) -> None:
         """The archive at this moment."""
+        return
 
 
-class NullObserver:
+class NullObserver(Observer):
     """Ignores everything."""
 
     snapshot_interval = 0
-
-    def progress(self, stage: str, iteration: int, total: int) -> None:
-        """Ignore it."""
-
-    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
-        """Ignore it."""
-
-    def snapshot(self, archive: ArchiveSnapshot) -> None:
-        """Ignore it."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from chsel.errors import MeshError, MeshWarning, SdfError, quoted, require_choice, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, ShapesShown, digest, frozen
+from chsel.problem.mesh import mesh_digest
 
 if TYPE_CHECKING:
     import trimesh
@@ -25,6 +26,8 @@ MAX_NODES = 50_000_000
 DEFAULT_NODES = 2_000_000  # at most, where the caller chooses no resolution; 64 MB
 FINEST, COARSEST = 1e-6, 1e3  # spacing of nodes, metres, so that rounding merges no nodes
 FARTHEST = 1e6  # coordinates of the first node, metres
+_MOST_KEPT = 4  # grids
+_kept: dict[tuple[str, float | None, float], SdfGrid] = {}  # those made last, in this order
 Derived = TypeVar("Derived")
 _NODES_PER_EXTENT = 20  # of the default grid, over the object's smallest extent
 _DEFAULT_SPACING = 0.01  # of its nodes, at most, metres
@@ -289,3 +292,22 @@ def _check_resolution(resolution: float) -> None:
 
 def _rounded(values: FloatArray) -> FloatArray:
     return values.astype(np.float32).astype(np.float64) + 0.0  # without negative zeros
+
+
+def object_grid(
+    mesh: trimesh.Trimesh,
+    resolution: float | None = None,
+    *,
+    padding: float = OBJECT_PADDING,
+    progress: Callable[[int, int], None] | None = None,
+) -> SdfGrid:
+    """The grid of a clean mesh by `SdfGrid.from_mesh`, kept for later calls with this mesh."""
+    key = mesh_digest(mesh), resolution, padding
+    grid = _kept.get(key)
+    if grid is None:
+        grid = SdfGrid.from_mesh(mesh, resolution, padding=padding, progress=progress)
+        if grid.values.size <= DEFAULT_NODES:
+            _kept[key] = grid
+        for oldest in list(_kept)[:-_MOST_KEPT]:
+            _kept.pop(oldest, None)
+    return grid

@@ -8,21 +8,12 @@ import numpy as np
 
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, leaf
-from chsel.numerics.pose_tuples import pose_at
-from chsel.numerics.threads import parallel_for
 from chsel.problem.poses import Poses, rotated
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.sdf_lookup import distance_at, distance_field
 from chsel.problem.streams import Purpose, StreamKey
-from chsel.problem.surface import surface_points
+from chsel.problem.surface import surface_distances, surface_points
 
 _PLACES = 64  # of a descriptor
-_LOOKUPS_PER_THREAD = 6400  # fewer are done before another thread wakes up
-
-
-def evenly_spaced(size: int, count: int) -> IntArray:
-    """At most `count` of the numbers below size, evenly spaced, beginning with 0."""
-    return np.arange(size) if size <= count else np.arange(count) * size // count
 
 
 def farthest_points(points: FloatArray, most: int, *, given: int = 0) -> IntArray:
@@ -84,31 +75,6 @@ def surface_descriptors(sdf: SdfGrid, poses: Poses) -> FloatArray:
     some = poses[np.arange(_PLACES) * len(poses) // _PLACES]
     places = rotated(np.swapaxes(some.rotations, 1, 2), surface - some.translations)
     return surface_distances(sdf, poses, places)
-
-
-def surface_distances(sdf: SdfGrid, poses: Poses, points: FloatArray) -> FloatArray:
-    """Signed distances (B, N), metres, of world points (N, 3) to the object's surface in poses."""
-    field = distance_field(sdf, "trilinear", "surface_point")
-    numbers, places = np.array(poses.numbers), np.array(points)
-    distances = np.empty((len(poses), len(points)))
-
-    def run(first: int, last: int, _: Any) -> None:
-        distances_from_surface(field, numbers, places, distances, first, last)
-
-    least = 1 + _LOOKUPS_PER_THREAD // max(len(points), 1)
-    parallel_for(run, len(poses), lambda: None, least=least)
-    return distances
-
-
-@compiled
-def distances_from_surface(
-    field: Any, poses: Any, places: Any, out: Any, first: Any, last: Any
-) -> None:
-    """Fill out (B, K) with the distances of world points (K, 3) in poses (B, 12), first to last."""
-    for b in range(first, last):
-        pose = pose_at(poses, b)
-        for k in range(len(places)):
-            out[b, k] = distance_at(field, pose, places[k, 0], places[k, 1], places[k, 2])
 
 
 @compiled

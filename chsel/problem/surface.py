@@ -1,17 +1,24 @@
-"""Points on the surface of an object, from its signed distance grid alone."""
+"""The surface of an object, from its grid alone, and how far the surfaces of poses are apart."""
 
 from __future__ import annotations
 
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 
 from chsel.errors import SdfError
-from chsel.numerics.arrays import FloatArray, IntArray
-from chsel.problem.sdf_grid import SdfGrid
+from chsel.numerics.arrays import FloatArray, IntArray, evenly_spaced
+from chsel.numerics.compiler import compiled
+from chsel.numerics.pose_tuples import pose_at
+from chsel.numerics.threads import parallel_for
+from chsel.problem.poses import Poses, rotated
+from chsel.problem.sdf_grid import FARTHEST, SdfGrid
+from chsel.problem.sdf_lookup import distance_at, distance_field
 from chsel.problem.streams import Purpose, StreamKey
 
 _CENTRE_POINTS = 1000
+_LOOKUPS_PER_THREAD = 6400  # fewer are done before another thread wakes up
 # The six tetrahedra of a cell, along its diagonal (Freudenthal, 1942): corners (6, 4, 3).
 _TETRAHEDRA = np.array(
     [np.cumsum([(0, 0, 0), *np.eye(3, dtype=np.int64)[list(p)]], 0) for p in permutations(range(3))]
@@ -115,3 +122,104 @@ def _triangles(
             share = values[:, a] / (values[:, a] - values[:, b])
             corners[:, t, e] = places[:, a] + share[:, None] * (places[:, b] - places[:, a])
     return corners.reshape(-1, 3, 3)
+
+
+_POINTS = 100
+
+
+def outline_distances(sdf: SdfGrid, poses: Poses) -> FloatArray:
+    """How far the object's surface in a pose is from that in another (B, B), metres.
+
+    Root mean square over points of both surfaces: 0 between poses that a symmetry maps to each
+    other. As exact as the grid's interpolation, a fraction of its resolution.
+    """
+    places = outline_in_world(sdf, poses)[:, ::2]  # (B, Q, 3): both surfaces have as many
+    squares = np.array([in_order(signed_distances(sdf, poses, there) ** 2) for there in places])
+    squares /= max(places.shape[1], 1)
+    apart: FloatArray = np.sqrt(0.5 * (squares + squares.T))
+    np.fill_diagonal(apart, 0.0)
+    return apart
+
+
+def surface_spread(distances: FloatArray, weights: FloatArray | None = None) -> float:
+    """Root mean square distance of the surfaces in two poses drawn from a set, metres.
+
+    This is the spread of hypotheses and of beliefs. distances (B, B), metres: `outline_distances`.
+    weights (B,): with which poses are drawn, each again; None: all alike.
+    """
+    if weights is None:
+        weights = np.full(len(distances), 1.0 / len(distances))
+    return float(np.sqrt(in_order(weights * in_order(weights * distances**2))))
+
+
+def outline_distances_to(sdf: SdfGrid, poses: Poses, other: Poses) -> FloatArray:
+    """How far the object's surface in each pose is from that in one other pose (B,), metres.
+
+    As in `outline_distances`. other: a single pose.
+    """
+    there = outline_in_world(sdf, poses)  # (B, Q, 3)
+    count, size = there.shape[:2]
+    forth = signed_distances(sdf, other, there.reshape(-1, 3)).reshape(count, size)
+    back = signed_distances(sdf, poses, outline_in_world(sdf, other)[0])  # (B, Q)
+    squares = in_order(forth**2) + in_order(back**2)
+    return np.sqrt(squares / (2 * max(size, 1)))
+
+
+def outline_in_world(sdf: SdfGrid, poses: Poses) -> FloatArray:
+    """Points (B, Q, 3) on the object's surface in each pose; Q is 0 for a grid without surface."""
+    turns = np.swapaxes(poses.rotations, 1, 2)
+    return rotated(turns[:, None], outline_in_object(sdf) - poses.translations[:, None])
+
+
+def outline_in_object(sdf: SdfGrid) -> FloatArray:
+    """Points (Q, 3) on the object's surface, object frame."""
+    return sdf.derived("outline", lambda: _outline(sdf))
+
+
+def signed_distances(sdf: SdfGrid, poses: Poses, points: FloatArray) -> FloatArray:
+    """Signed distances (B, N), metres, of world points (N, 3), at most FARTHEST."""
+    return np.minimum(surface_distances(sdf, poses, points), FARTHEST)
+
+
+def in_order(values: FloatArray) -> FloatArray:
+    """Sums along the last axis, added in their order, so that they are the same everywhere."""
+    if values.shape[-1] == 0:
+        return np.zeros(values.shape[:-1])
+    return np.cumsum(values, axis=-1)[..., -1]
+
+
+def _outline(sdf: SdfGrid) -> FloatArray:
+    """Points (Q, 3) on the object's surface, object frame; none if the grid has no surface."""
+    if has_surface(sdf):
+        return surface_points(sdf, _POINTS, StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
+    near = np.argwhere(np.abs(sdf.values) < 2.0 * sdf.resolution)  # of objects thinner than that
+    near = near[evenly_spaced(len(near), _POINTS)]
+    i, j, k = near.T
+    away = sdf.values[i, j, k][:, None] * sdf.gradients[i, j, k]
+    points: FloatArray = sdf.origin + near * sdf.resolution - away
+    return points
+
+
+def surface_distances(sdf: SdfGrid, poses: Poses, points: FloatArray) -> FloatArray:
+    """Signed distances (B, N), metres, of world points (N, 3) to the object's surface in poses."""
+    field = distance_field(sdf, "trilinear", "surface_point")
+    numbers, places = np.array(poses.numbers), np.array(points)
+    distances = np.empty((len(poses), len(points)))
+
+    def run(first: int, last: int, _: Any) -> None:
+        distances_from_surface(field, numbers, places, distances, first, last)
+
+    least = 1 + _LOOKUPS_PER_THREAD // max(len(points), 1)
+    parallel_for(run, len(poses), lambda: None, least=least)
+    return distances
+
+
+@compiled
+def distances_from_surface(
+    field: Any, poses: Any, places: Any, out: Any, first: Any, last: Any
+) -> None:
+    """Fill out (B, K) with the distances of world points (K, 3) in poses (B, 12), first to last."""
+    for b in range(first, last):
+        pose = pose_at(poses, b)
+        for k in range(len(places)):
+            out[b, k] = distance_at(field, pose, places[k, 0], places[k, 1], places[k, 2])

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from chsel.errors import PointsWarning, PoseError, require_positive
-from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from chsel.problem.noise import (
     FOREIGN,
     FREEDOMS,
@@ -19,15 +19,6 @@ from chsel.problem.noise import (
     NoiseModel,
     estimate_noise,
     noise_model,
-)
-from chsel.problem.outline import (
-    in_order,
-    outline_distances,
-    outline_distances_to,
-    outline_in_object,
-    outline_in_world,
-    signed_distances,
-    surface_spread,
 )
 from chsel.problem.poses import (
     Poses,
@@ -39,7 +30,15 @@ from chsel.problem.poses import (
 )
 from chsel.problem.registration_problem import VERDICTS, Hypotheses, RegistrationProblem, Trust
 from chsel.problem.sdf_grid import FARTHEST, SdfGrid
-from chsel.problem.subset import evenly_spaced
+from chsel.problem.surface import (
+    in_order,
+    outline_distances,
+    outline_distances_to,
+    outline_in_object,
+    outline_in_world,
+    signed_distances,
+    surface_spread,
+)
 
 SENSOR_NOISE = 0.0005  # metres, of known points, where nothing is known about the sensor
 DETERMINED, SEVERAL, WIDE, NOTHING = VERDICTS

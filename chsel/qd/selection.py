@@ -8,12 +8,12 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from chsel.errors import ChselError, require_at_most
-from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.search_space import SearchSpace, origin_bounds
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
-from chsel.problem.subset import evenly_spaced, representative_poses
+from chsel.problem.subset import representative_poses
 from chsel.problem.surface import has_surface
 from chsel.qd.archive import Evaluated, GridArchive, SearchObjective
 from chsel.qd.measures import MEASURES, Measure

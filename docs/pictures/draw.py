@@ -25,13 +25,13 @@ from chsel.methods.anchored.anchored import EFFORTS, Anchored, AnchoredSettings,
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.surface_distance import SurfaceDistance, surface_points
 from chsel.problem.noise import FOREIGN
-from chsel.problem.outline import signed_distances
 from chsel.problem.poses import Poses, apply, inverse
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.search_space import search_space
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
+from chsel.problem.surface import signed_distances
 from replay.comparing.choices import recorded_method
 from replay.mcap.reader import read_recording
 from replay.rerun.scene import coarsened, deepest

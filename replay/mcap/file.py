@@ -20,7 +20,7 @@ from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import RecordingError
-from chsel.problem.file_checks import refuse_special_file
+from chsel.numerics.arrays import refuse_special_file
 from replay.mcap.schemas import PROFILE
 from replay.mcap.texts import one_line
 

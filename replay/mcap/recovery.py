@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from chsel.errors import ChselError, RecordingError
-from chsel.problem.defaults import object_grid
 from chsel.problem.points import KnownPoints
+from chsel.problem.sdf_grid import object_grid
 from replay.events import (
     ActionsOffered,
     Event,

@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import ChselError
-from chsel.numerics.arrays import frozen
+from chsel.numerics.arrays import frozen, read_npz
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import PlausibleSet, load_plausible
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import object_symmetry
-from chsel.problem.file_checks import read_npz
 from chsel.problem.poses import Poses, check_rigid, inverse
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.search_space import search_space

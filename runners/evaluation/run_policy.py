@@ -12,7 +12,7 @@ from chsel.next_probe.forecast import belief_after, belief_before
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.symmetry import object_symmetry
 from chsel.policies.policy import PolicySettings, StopSettings
-from chsel.problem import outline
+from chsel.problem import surface
 from chsel.problem.online_registration import OnlineRegistration, OnlineStep
 from chsel.problem.poses import Poses, inverse
 from chsel.problem.sdf_grid import SdfGrid
@@ -76,11 +76,11 @@ def _row(
 
     def errors(poses: FloatArray) -> FloatArray:
         """How far the surface in poses (B, 4, 4), object_from_world, is from the true one (B,)."""
-        return outline.outline_distances_to(scene.sdf, Poses.of(poses), truth)
+        return surface.outline_distances_to(scene.sdf, Poses.of(poses), truth)
 
     after, key = None if run.steering is None else run.steering.last, StreamKey(seed, step.step + 1)
     belief = _belief(scene, settings, key, online) if after is None else after.problem.belief
-    error = outline.in_order(belief.weights * errors(belief.object_from_world))
+    error = surface.in_order(belief.weights * errors(belief.object_from_world))
     row: dict[str, Any] = {
         "step": step.step,
         "probes": step.step + 1,
@@ -134,7 +134,7 @@ def _belief(
 def spread_of(sdf: SdfGrid, belief: Belief) -> float:
     """Spread of a belief, metres, as decisions have it."""
     poses = Poses.of(belief.object_from_world)
-    return outline.surface_spread(outline.outline_distances(sdf, poses), belief.weights)
+    return surface.surface_spread(surface.outline_distances(sdf, poses), belief.weights)
 
 
 def promised_gain(decision: Decision) -> float | None:

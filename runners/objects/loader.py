@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from chsel.errors import MeshWarning, SettingError, require_choice
-from chsel.problem.defaults import object_grid
 from chsel.problem.mesh import load_mesh
 from chsel.problem.points import Workspace
-from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.sdf_grid import SdfGrid, object_grid
 from chsel.problem.settings import CheckedSettings, one_of, positive
 from runners.objects.scans import SCANS, scan_file
 

@@ -10,8 +10,7 @@ import numpy as np
 import yaml
 
 from chsel.errors import ChselError, SessionError
-from chsel.numerics.arrays import FloatArray, frozen
-from chsel.problem.file_checks import refuse_special_file
+from chsel.numerics.arrays import FloatArray, frozen, refuse_special_file
 from chsel.problem.poses import nearest_rigid
 from replay.files import new_file, whole_file
 

@@ -11,10 +11,14 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import ChselError, PointsError, PoseError, SettingError, require_positive
-from chsel.numerics.arrays import FloatArray, IntArray, frozen
-from chsel.problem.defaults import FREE_RESOLUTION, workspace_around
-from chsel.problem.file_checks import read_npz
-from chsel.problem.points import KnownPoints, Workspace, check_points
+from chsel.numerics.arrays import FloatArray, IntArray, frozen, read_npz
+from chsel.problem.points import (
+    FREE_RESOLUTION,
+    KnownPoints,
+    Workspace,
+    check_points,
+    workspace_around,
+)
 from chsel.problem.poses import nearest_rigid
 from chsel.problem.sdf_grid import OBJECT_PADDING
 from chsel.problem.streams import LAST_STEP

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from chsel.problem.noise import EXTENT, INDEPENDENT, LATER, SHARE
+from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.poses import apply, compose, hat, random_rotations
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.sdf_grid import SdfGrid
@@ -115,3 +116,11 @@ def _gram_schmidt(rows):
 
 def _unit(vectors):
     return vectors / vectors.norm(dim=1, keepdim=True).clamp_min(1e-12)
+
+
+def pose_problem(sdf, points, workspace, free_resolution, key, settings, previous):
+    """The problem of a step, as an online registration poses it."""
+    online = OnlineRegistration(
+        sdf, workspace, free_resolution, settings, seed=key.seed, points=points, previous=previous
+    )
+    return online.pose(key.step)

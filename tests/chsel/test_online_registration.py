@@ -12,12 +12,11 @@ from chsel.problem.online_registration import (
     OnlineSettings,
     Start,
     first_initial_set,
-    pose_problem,
     updated_initial_set,
 )
 from chsel.problem.poses import axis_angle, compose, inverse, rotation_angle
 from chsel.problem.streams import StreamKey
-from tests.chsel.samples import hypotheses_at
+from tests.chsel.samples import hypotheses_at, pose_problem
 
 GRID = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.06, 0.04)), 0.02)
 WORKSPACE = Workspace((-0.1, -0.3, 0.0), (0.5, 0.3, 0.6))

@@ -8,7 +8,6 @@ import numpy as np
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.objective import Objective
-from chsel.problem.online_registration import pose_problem
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import NullObserver
@@ -17,6 +16,7 @@ from chsel.problem.search_space import search_space
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd.emitters import SEARCHES
 from chsel.qd.measures import MEASURES
+from tests.chsel.samples import pose_problem
 
 PROBLEMS_FILE = Path(__file__).with_name("problems.npz")
 """Grids of two bodies, and points around them: stored, so that no mesh, sine or BLAS matters."""

@@ -9,8 +9,8 @@ import pytest
 
 from chsel.errors import SettingError
 from chsel.methods.anchored.anchored import Anchored
-from chsel.problem.outline import outline_in_world
 from chsel.problem.poses import Poses, apply, inverse
+from chsel.problem.surface import outline_in_world
 from replay.mcap.reader import read_recording
 from runners import evaluate, probe
 from runners.evaluation.contenders import chosen_policies

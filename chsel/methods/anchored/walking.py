@@ -19,11 +19,11 @@ from chsel.numerics.arrays import FloatArray, scratch
 from chsel.numerics.cell_set import triple
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp, log
-from chsel.numerics.philox import Stream, fill_uniforms
 from chsel.numerics.pose_tuples import moved, origin_within, pose_at
 from chsel.numerics.threads import parallel_for
 from chsel.problem.poses import Poses
 from chsel.problem.search_space import SE2Space, SearchSpace
+from chsel.problem.streams import Stream, fill_uniforms
 
 _DRAWS = 10  # random numbers that a move takes
 _MOVES = 8  # whose random numbers are drawn together

@@ -11,7 +11,6 @@ import trimesh
 from chsel.methods.anchor_sampling import most_informative_first
 from chsel.methods.anchored.energy import Energy
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.online_registration import pose_problem
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, product
 from chsel.problem.registration_problem import (
@@ -21,6 +20,7 @@ from chsel.problem.registration_problem import (
 )
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
+from tests.chsel.samples import pose_problem
 
 TRUTH = compose(axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3]))
 STANDING = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(2.0)), np.array([0.2, 0.1, 0.3]))

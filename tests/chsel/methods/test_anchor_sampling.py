@@ -3,8 +3,12 @@
 import numpy as np
 import pytest
 
-from chsel.methods.anchor_kernels import UNIT
-from chsel.methods.anchor_sampling import AnchorSampler, AnchorSettings, most_informative_first
+from chsel.methods.anchor_sampling import (
+    UNIT,
+    AnchorSampler,
+    AnchorSettings,
+    most_informative_first,
+)
 from chsel.numerics.threads import threads
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, axis_angle, compose

@@ -9,12 +9,10 @@ import trimesh
 from chsel.errors import ChselError
 from chsel.methods import build_method, trust_by
 from chsel.methods.anchor_sampling import AnchorSampler
-from chsel.methods.anchored.anchored import Anchored, AnchoredSettings, Effort, Search
-from chsel.methods.anchored.modes import distinct
+from chsel.methods.anchored.anchored import Anchored, AnchoredSettings, Effort, Search, distinct
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.noise import LATER, WRONG, noise_model
-from chsel.problem.outline import outline_distances_to
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, axis_angle, check_rigid, compose, inverse
 from chsel.problem.registration_problem import (
@@ -24,6 +22,7 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.streams import StreamKey
 from chsel.problem.subset import surface_descriptors
+from chsel.problem.surface import outline_distances_to
 from chsel.problem.trust import trust_in
 from tests.chsel.methods.scene import GRID, ODD, POINTS, SIDE, TRUTH, Watcher, known_points, posed
 from tests.chsel.samples import hypotheses_at, plain_energies

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from scipy.optimize import minimize
 
+from chsel.methods.anchored.anchored import FAR, distinct, has_new_mode, near_symmetries
 from chsel.methods.anchored.fitting import fitted, twists_of
-from chsel.methods.anchored.modes import FAR, distinct, has_new_mode, near_symmetries
 from chsel.methods.anchored.walking import stride_of, walked
 from chsel.problem.noise import LEVELS, NoiseModel, noise_model
 from chsel.problem.points import KnownPoints

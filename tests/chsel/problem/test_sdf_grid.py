@@ -6,9 +6,8 @@ import trimesh
 
 from chsel import SdfGrid
 from chsel.errors import MeshError, MeshWarning, SdfError, SettingError
-from chsel.problem.defaults import object_grid
 from chsel.problem.mesh import load_mesh
-from chsel.problem.sdf_grid import DEFAULT_NODES, mesh_sdf
+from chsel.problem.sdf_grid import DEFAULT_NODES, mesh_sdf, object_grid
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import surface_points
 from tests.chsel.samples import ball_grid, box_distance
@@ -94,7 +93,7 @@ def test_a_mesh_has_one_default_grid_which_is_kept_for_later_calls(monkeypatch):
     for scale in (0.9, 0.8, 0.7):
         object_grid(BOX.copy().apply_scale(scale))
     assert object_grid(BOX) is not grid  # the oldest of more than are kept
-    monkeypatch.setattr("chsel.problem.defaults.DEFAULT_NODES", grid.values.size - 1)
+    monkeypatch.setattr("chsel.problem.sdf_grid.DEFAULT_NODES", grid.values.size - 1)
     assert object_grid(BOX, 0.004) is not object_grid(BOX, 0.004)
 
 

@@ -4,8 +4,7 @@ import pytest
 from scipy.stats import kstest
 
 from chsel.errors import SettingError
-from chsel.numerics.philox import fill_uniforms
-from chsel.problem.streams import Purpose, StreamKey, normals, uniforms
+from chsel.problem.streams import Purpose, StreamKey, fill_uniforms, normals, uniforms
 
 
 def stream(seed=3):

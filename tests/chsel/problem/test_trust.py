@@ -17,10 +17,10 @@ from chsel.problem.noise import (
     estimate_noise,
     noise_model,
 )
-from chsel.problem.outline import outline_distances
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import VERDICTS, RegistrationProblem
 from chsel.problem.streams import StreamKey
+from chsel.problem.surface import outline_distances
 from chsel.problem.trust import (
     FOREIGN_CONTACT,
     LEAST_GAP,

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from chsel.errors import RecordingError, SessionError
-from chsel.problem.defaults import object_grid
+from chsel.problem.sdf_grid import object_grid
 from replay.__main__ import main
 from replay.comparing.verification import EQUAL, NO_RESULT, verify
 from replay.events import (

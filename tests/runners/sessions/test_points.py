@@ -3,8 +3,8 @@ import pytest
 import trimesh
 
 from chsel.errors import PointsError, SettingError
-from chsel.problem.defaults import object_grid
-from chsel.problem.file_checks import read_npz
+from chsel.numerics.arrays import read_npz
+from chsel.problem.sdf_grid import object_grid
 from runners.objects.loader import ObjectModel
 from runners.sessions.points import PointsSession, PointsSettings, read_points
 

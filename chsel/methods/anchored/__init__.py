@@ -1,1 +1,0 @@
-"""Contact-anchored search."""
