@@ -1,7 +1,11 @@
-"""Which package may import which, and inside a package which folder may import which."""
+"""Who may import whom, and the Makefile."""
 
 import ast
 import re
+import shutil
+import subprocess
+import sys
+import venv
 from collections import Counter
 
 import pytest
@@ -152,3 +156,31 @@ def test_an_arrow_back_up_and_a_circle_inside_a_folder_are_seen(tmp_path):
     assert len(found) == len(ABOVE)
     (circle,) = circles(plant(tmp_path / "other", CIRCLE))
     assert circle == ["chsel.cost.d", "chsel.cost.e", "chsel.cost.f"]
+
+
+pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+
+
+def made(folder, *words):
+    for name in ("Makefile", "constraints.txt", "pyproject.toml"):
+        shutil.copy(REPOSITORY / name, folder)
+    command = ["make", f"PYTHON={sys.executable}", *words]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+@pytest.mark.parametrize("version", [None, "2.9.1+cpu"])
+def test_a_torch_that_is_there_stays(version, tmp_path):
+    venv.create(tmp_path / ".venv", with_pip=False)
+    if version is not None:
+        (packages,) = (tmp_path / ".venv").glob("lib/python*/site-packages")
+        metadata = packages / f"torch-{version}.dist-info" / "METADATA"
+        metadata.parent.mkdir()
+        metadata.write_text(f"Metadata-Version: 2.1\nName: torch\nVersion: {version}\n")
+    made(tmp_path, ".venv/constraints.txt")
+    asked = (tmp_path / ".venv" / "constraints.txt").read_text().splitlines()
+    pinned = (REPOSITORY / "constraints.txt").read_text().splitlines()
+    torch = [line for line in pinned if line.startswith("torch==")]
+    assert len(torch) == 1
+    assert asked == [line for line in pinned if version is None or line not in torch]

@@ -1,20 +1,28 @@
+"""What a run writes, and commands that share one way in."""
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import trimesh
 
+import chsel
 from chsel.errors import RecordingError
 from chsel.methods import build_method
 from chsel.numerics.arrays import digest
 from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import apply, axis_angle, compose
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from replay.events import Event, Recorder, SnapshotTaken, Traced
+from replay.events import Event, Measured, Recorder, SnapshotTaken, Traced
+from replay.mcap.reader import read_recording
 from replay.recorder import ListRecorder
 from replay.registration import StepObserver
+from runners.objects.loader import load_model
+from runners.probe import main
 from runners.run.recording import make_run_folder
+from tests.runners.in_process import run
 
 
 @pytest.mark.parametrize("name", ["ycb/drill", "../../x", "a\0b", "x" * 5000, "a b\n"])
@@ -75,3 +83,70 @@ def test_a_trace_is_of_the_moment_at_which_it_was_handed_over(count):
     StepObserver(recorder, 0, 5, lambda *_: None).trace("descent", 10, vectors, cost)
     vectors[:], cost[:] = 0.0, 0.0
     assert recorder.events == [Traced(0, "descent", 10, *expected)]
+
+
+POSE = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
+
+
+@pytest.fixture(scope="module")
+def mesh_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("mesh") / "mustard.ply"
+    load_model("mustard").export(path)
+    return path
+
+
+def known(mesh):
+    """Points of every class on, in and around a mesh at POSE."""
+    surface = trimesh.sample.sample_surface(mesh, 24, seed=0)[0]
+    around = np.random.default_rng(0).uniform(-0.2, 0.2, (2000, 3)) + mesh.bounds.mean(axis=0)
+    height = chsel.SdfGrid.from_mesh(mesh, 0.01, padding=0.25).at(around, lookup="trilinear")[0]
+    far = np.asarray(height > 0.02)
+    inside = np.asarray(height < -0.02)
+    points = {"surface": surface, "free": around[far], "occupied": around[inside][:5]}
+    return {name: apply(POSE, group) for name, group in points.items()}
+
+
+def recorded(folder, mesh_file, points, *overrides):
+    """What the command records, with its default settings but for the folders."""
+    np.savez(folder / "points.npz", **points)
+    chosen = ["session=points", f"session.path={folder / 'points.npz'}", "object=mesh"]
+    chosen += [f"object.path={mesh_file}", "recording=mcap", f"logs={folder / 'logs'}"]
+    done = run(main, *chosen, *overrides)
+    assert done.returncode == 0, done.stderr
+    (path,) = (folder / "logs").rglob("recording.mcap")
+    return read_recording(path)
+
+
+@pytest.mark.parametrize("method", ["chsel", "anchored"])
+def test_a_file_of_points_and_the_same_arrays(tmp_path, mesh_file, method):
+    mesh = chsel.load_mesh(mesh_file)
+    points = known(mesh)
+    beside = {"known": points["surface"][:3] + 0.001, "known_sdf": np.array([0.0, 0.001, -0.001])}
+    recording = recorded(tmp_path, mesh_file, {**points, **beside}, f"method={method}", "seed=3")
+    target = trimesh.load_mesh(mesh_file, process=False) if method == "chsel" else mesh
+    found = chsel.register(target, **points, **beside, method=method, seed=3)
+    assert found.digest == recording.hypotheses(0).digest
+    assert found.trust is not None
+    (measured,) = (event for event in recording.events() if isinstance(event, Measured))
+    assert measured.values.items() >= found.trust.numbers.items()
+
+
+def test_a_sequence_in_the_workspace_of_all_its_points(tmp_path, mesh_file):
+    mesh = chsel.load_mesh(mesh_file)
+    points = known(mesh)
+    steps = {f"{name}_step": np.arange(len(group)) % 2 for name, group in points.items()}
+    recording = recorded(tmp_path, mesh_file, {**points, **steps}, "method=anchored")
+    every = np.concatenate(list(points.values()))
+    workspace = chsel.Workspace.around(every, recording.start.sdf.diameter)
+    assert workspace == recording.start.workspace
+    found = None
+    for step in range(2):
+        order = {name: np.argsort(steps[f"{name}_step"], kind="stable") for name in points}
+        so_far = {
+            name: group[order[name]][: np.sum(steps[f"{name}_step"] <= step)]
+            for name, group in points.items()
+        }
+        found = chsel.register(
+            mesh, **so_far, method="anchored", workspace=workspace, previous=found, step=step
+        )
+        assert found.digest == recording.hypotheses(step).digest

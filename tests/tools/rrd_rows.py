@@ -40,11 +40,6 @@ def shown_at(rows, step):
     return shown
 
 
-def until_probe(rows, step):
-    """What a view at a probe draws from: the last value counts."""
-    return [values for times, values in rows if times.get("probe", step + 1) <= step]
-
-
 def last_layout(path):
     """The rows of the blueprint that counts."""
     reader = RrdReader(path)

@@ -5,9 +5,8 @@ import dataclasses
 import numpy as np
 import trimesh
 
-from chsel.methods import build_method, trust_by
+from chsel.methods import build_method
 from chsel.next_probe.decision_problem import Actions, HandShape
-from chsel.plausible.pose_metrics import result_numbers
 from chsel.policies import build_policy
 from chsel.policies.steering import Steering
 from chsel.problem.online_registration import OnlineRegistration
@@ -17,9 +16,7 @@ from chsel.problem.settings import settings_mapping
 from replay.events import (
     ActionsOffered,
     Decided,
-    HypothesesFound,
     Logged,
-    Measured,
     Probe,
     ProblemPosed,
     RigDescribed,
@@ -167,25 +164,3 @@ def _probe(random, step):
         known_sdf=np.repeat([0.0, 0.01], 5),
     )
     return Probe(step, "contact", new, np.eye(4)[None].repeat(2, axis=0), surface, normals)
-
-
-def measured_again(events, method=None):
-    """The events with the measured values that follow from their results by today's definition.
-
-    method: that found them, for how far they are trusted; None: without.
-    """
-    found = []
-    for event in events:
-        if isinstance(event, SessionStarted):
-            start = event
-        elif isinstance(event, ProblemPosed):
-            problem = event.problem
-        elif isinstance(event, HypothesesFound):
-            hypotheses = event.hypotheses
-        elif isinstance(event, Measured):
-            truth, symmetry = start.world_from_object, symmetry_for_errors(start)
-            trust = None if method is None else trust_by(method, problem, hypotheses)
-            numbers = result_numbers(hypotheses, problem, truth, symmetry, trust)
-            event = Measured(event.step, numbers)
-        found.append(event)
-    return found
