@@ -25,7 +25,7 @@ from runners.evaluation.plan import Plan
 FILE = "experiment.json"
 _MAY_GROW = ("methods", "outside", "policies")
 _MAY_DIFFER = {"name", "configurations", "seeds", "commands", "environments", *_MAY_GROW}
-_OF_MACHINE = {"folder", "assets", "recordings"}  # what is none of the results
+_OF_MACHINE = {"folder", "assets", "recordings"}  # no result depends on these
 Row = Mapping[str, Any]
 _TEXT, _COUNT, _NUMBER, _FLAG = pa.string(), pa.int64(), pa.float64(), pa.bool_()
 

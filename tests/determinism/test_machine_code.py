@@ -60,7 +60,7 @@ def optimised(dispatcher):
 
 
 def assembly(code, cpu):
-    """What a CPU is told to do. Raises ValueError for code that is for this host alone."""
+    """The assembly of code for a CPU. Raises ValueError for code that is for this host alone."""
     code = _TARGET.sub("", code)
     if cpu.triple != llvm.get_process_triple():
         code = _REFERENCE_COUNT.sub(r"\1add i8 0, 0", code)

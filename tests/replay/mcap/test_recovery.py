@@ -272,7 +272,7 @@ def same(read, written):
 def test_reading_and_recovering_a_damaged_recording(tmp_path, original, damage):
     """Strictly: all of it, or an error. Else how it began. Recovered: nothing that was not there.
 
-    All of that is a finished recording, and every loss is told.
+    All of that is a finished recording, and every loss is reported.
     """
     path, out = tmp_path / "damaged.mcap", tmp_path / "out.mcap"
     out.unlink(missing_ok=True)

@@ -60,7 +60,7 @@ class SphereLog:
 
     unit: metres of a unit of the camera's images. camera_clock: seconds by which it is ahead.
     lost_transforms: seconds between which the hand sends none. left_out: topics without messages.
-    finger: metres at which a joint of this name stands; None: no joint is told of. cloud: points
+    finger: metres at which a joint of this name stands; None: no joint states. cloud: points
     (N, 3) in the lidar's frame, sent on /lidar and /skin before and in the first probe.
     """
 
