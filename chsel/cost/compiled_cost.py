@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from functools import partial
 
 import numpy as np
 
 from chsel.cost.cost_kernels import LANES, Model, costs_of_poses, work_of
-from chsel.cost.cost_settings import CostSettings, InteriorPoints, interior_points
+from chsel.cost.cost_settings import CostSettings, InteriorPoints, interior_points, warn_if_too_deep
 from chsel.cost.free_kernels import FreeTerm
 from chsel.errors import require_choice
 from chsel.numerics.arrays import FloatArray
@@ -119,12 +118,7 @@ def _free_term(
         alpha, lookup, weights = settings.alpha, settings.lookup, np.zeros(0)
         tree, cells = point_tree(free, free_resolution), cells_below(sdf, alpha, lookup)
         centre, radius = _sphere_around_cells(sdf, alpha, lookup)
-        if len(free) and cells.steps[:-2].all():
-            warnings.warn(
-                f"no node of the SDF is deeper than {-alpha} m: free points cannot be violated; "
-                "use a smaller penetration_tolerance",
-                stacklevel=4,
-            )
+        warn_if_too_deep(sdf, free, alpha)
         lower, upper = (triple(corner) for corner in bounds_of(free)) if len(free) else _NO_BOX
     return FreeTerm(
         interior=is_interior,

@@ -86,6 +86,13 @@ def uncertain_depth(sdf: SdfGrid, depth: float) -> float:
     return min(depth, 0.5 * max(-float(sdf.values.min()), 0.0))
 
 
+def warn_if_too_deep(sdf: SdfGrid, free: FloatArray, alpha: float) -> None:
+    """Warn if there are free points, and nothing of the object is as deep as they may be."""
+    if len(free) and not (sdf.values < alpha).any():
+        text = f"no node of the SDF is deeper than {-alpha} m: free points cannot be violated; "
+        warnings.warn(text + "use a smaller penetration_tolerance", stacklevel=5)
+
+
 @dataclass(frozen=True)
 class InteriorPoints:
     """Points inside an object, on a lattice."""

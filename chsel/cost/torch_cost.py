@@ -12,7 +12,7 @@ except ModuleNotFoundError as error:
         "RelaxedCost needs torch: pip install 'chsel-replay[torch]'", name="torch"
     ) from error
 
-from chsel.cost.cost_settings import CostSettings, interior_points
+from chsel.cost.cost_settings import CostSettings, interior_points, warn_if_too_deep
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, VoxelGrid, require_parts
 from chsel.problem.poses import stacked
@@ -50,6 +50,7 @@ class RelaxedCost:
             self._voxels = VoxelGrid.around(points.free, free_resolution)
             self._inside, self._normals = _tensor(interior.points), _tensor(interior.normals)
             self._weights = _tensor(interior.weights(settings, free_resolution))
+        warn_if_too_deep(sdf, points.free, settings.alpha)
         deep = np.argwhere(sdf.values < settings.alpha)
         corners = (deep.min(axis=0) - 1, deep.max(axis=0) + 1) if len(deep) else (1, 0)
         # Free points outside of this box cost nothing.

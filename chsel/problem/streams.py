@@ -56,7 +56,7 @@ class StreamKey:
         for name, bits in (("seed", 64), ("step", 32)):
             value = getattr(self, name)
             is_integer = isinstance(value, Integral) and not isinstance(value, bool)
-            if not is_integer or not 0 <= value < 2**bits:
+            if not is_integer or not 0 <= value < 1 << bits:
                 raise SettingError(
                     f"{name} is {quoted(value)}; accepted: an integer from 0 to 2**{bits} - 1"
                 )
