@@ -1,13 +1,16 @@
 """python -m tests.tools.mutants ROOM: how many single mistakes the tests of a room notice.
 
 ROOM: a folder or a file of the product. Cosmic Ray names every place where a number, an operator,
-a comparison or a condition can be changed; a random sample of these mutants is made in a copy of
-the tree, one at a time, and the tests of the room are run on each, golden digests and stored
-replays left out. Kernels are compiled again, as their code is kept by what is in the files.
+a comparison or a condition can be changed, and the first two arguments of every call can be
+swapped. A random sample of these mutants is made in a copy of the tree, one at a time, and the
+tests of the room are run on each, golden digests and stored replays left out. Kernels are compiled
+again, as their code is kept by what is in the files.
 """
 
 import argparse
+import ast
 import difflib
+import itertools
 import os
 import random
 import shutil
@@ -50,25 +53,49 @@ OPERATORS = [
         )
     ),
 ]
-Mutant = tuple[Path, str, int]  # file, operator, its occurrence
+SWAPPED = "swapped arguments"
 
 
 def mutants_of(file):
-    """Every mutant of a file."""
-    nodes = list(ast_nodes(get_ast((ROOT / file).read_text())))
+    """Every mutant of a file: the file, what is changed, and at which of its places."""
+    code = (ROOT / file).read_text()
+    nodes = list(ast_nodes(get_ast(code)))
     for operator in OPERATORS:
         change = get_operator(f"core/{operator}")()
         count = sum(len(list(change.mutation_positions(node))) for node in nodes)
         yield from ((file, operator, occurrence) for occurrence in range(count))
+    yield from ((file, SWAPPED, occurrence) for occurrence in range(len(swappable(code))))
+
+
+def swappable(code):
+    """The first two arguments of every call that has them."""
+    calls = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Call)]
+    pairs = [call.args[:2] for call in calls if len(call.args) > 1]
+    return [pair for pair in pairs if not any(isinstance(each, ast.Starred) for each in pair)]
+
+
+def changed(code, operator, occurrence):
+    """The code of a mutant."""
+    if operator != SWAPPED:
+        return mutate_code(code, get_operator(f"core/{operator}")(), occurrence) or code
+    lines = code.encode().splitlines(keepends=True)
+    starts = [0, *itertools.accumulate(map(len, lines))]
+    whole = b"".join(lines)
+    (a, b), (c, d) = (
+        (
+            starts[each.lineno - 1] + each.col_offset,
+            starts[each.end_lineno - 1] + each.end_col_offset,
+        )
+        for each in swappable(code)[occurrence]
+    )
+    return (whole[:a] + whole[c:d] + whole[b:c] + whole[a:b] + whole[d:]).decode()
 
 
 def tests_of(room):
-    """The tests of a room: its folder of `tests`, or the file there that is named after it."""
-    folder = ROOT / "tests" / room
-    if folder.is_dir():
-        return [str(Path("tests") / room)]
-    named = sorted((ROOT / "tests" / room.parent).glob(f"test_{room.stem}.py"))
-    return [str(file.relative_to(ROOT)) for file in named]
+    """The tests of a room: its folder of `tests`, or the files named after it, or all beside it."""
+    folder = ROOT / "tests" / room.with_suffix("")
+    named = [folder] if folder.is_dir() else sorted(folder.parent.glob(f"test_{room.stem}*.py"))
+    return [str(each.relative_to(ROOT)) for each in named or [folder.parent]]
 
 
 def copied_to(folder):
@@ -85,6 +112,7 @@ def passes(folder, tests, seconds=None):
     """Whether all tests pass in a copy; one that takes longer has noticed something."""
     command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", *tests]
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment["CHSEL_CACHE_DIR"] = str(folder / "kernels")
     try:
         done = subprocess.run(
             command, cwd=folder, env=environment, capture_output=True, timeout=seconds
@@ -112,18 +140,18 @@ def main():
         if not passes(folder, tests):
             console.print(f"error: {' '.join(tests)} fail as they are; accepted: tests that pass")
             return 2
-        longest = 10.0 * (time.monotonic() - begun) + 300.0  # kernels are compiled again
+        longest = 3.0 * (time.monotonic() - begun) + 60.0  # kernels are compiled again
         noticed = 0
         for number, (file, operator, occurrence) in enumerate(chosen, 1):
             code = (ROOT / file).read_text()
-            changed = mutate_code(code, get_operator(f"core/{operator}")(), occurrence) or code
-            (folder / file).write_text(changed)
+            mutant = changed(code, operator, occurrence)
+            (folder / file).write_text(mutant)
             survived = passes(folder, tests, longest)
             (folder / file).write_text(code)
             noticed += not survived
             if survived:
                 lines = difflib.unified_diff(
-                    code.splitlines(), changed.splitlines(), lineterm="", n=1
+                    code.splitlines(), mutant.splitlines(), lineterm="", n=1
                 )
                 console.print(f"[red]not noticed[/]: {file}", *list(lines)[2:], sep="\n")
             console.print(f"{noticed} of {number} noticed", style="dim")
