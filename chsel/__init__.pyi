@@ -31,8 +31,11 @@ from .problem.registration_problem import RegistrationProblem as RegistrationPro
 from .problem.registration_problem import Trust as Trust
 from .problem.sdf_grid import SdfGrid as SdfGrid
 from .problem.trust import trust_in as trust_in
+from .sensing.depth_camera import PinholeCamera as PinholeCamera
 from .sensing.free_space import FreeGrid as FreeGrid
 from .sensing.free_space import interior_lattice as interior_lattice
 from .sensing.free_space import poses_between as poses_between
+from .session import NextProbe as NextProbe
+from .session import Session as Session
 
 __version__: str

@@ -83,7 +83,8 @@ def register(
         what = "the Hypotheses of the registration before, or None"
         require_instance("previous", previous, Hypotheses, what)
     method = default_method(preset) if method is None else method
-    solver = build_method(method, _settings(method, preset, settings, hypotheses))
+    more = None if hypotheses is None else {"online": {"hypotheses": hypotheses}}
+    solver = build_method(method, method_settings(method, preset, settings, more))
     sdf = _grid(target, resolution)
     _warn(check_points(points, sdf.diameter, free_resolution, workspace) + check_contacts(points))
     workspace = workspace or workspace_around(points, sdf)
@@ -140,15 +141,15 @@ def _grid(target: trimesh.Trimesh | SdfGrid, resolution: float | None) -> SdfGri
     return object_grid(clean_mesh(target.vertices, target.faces, name="target"), resolution)
 
 
-def _settings(method: str, preset: str, changes: Any, hypotheses: int | None) -> Any:
-    """The preset's settings with changes laid over them."""
+def method_settings(method: str, preset: str, *changes: Any) -> Any:
+    """The preset's settings with changes laid over them: mappings, or whole settings objects."""
     chosen = preset_settings(method, preset)
-    if dataclasses.is_dataclass(changes) and not isinstance(changes, type):
-        chosen = changes
-    elif changes is not None:
-        require_instance("settings", changes, Mapping, "a mapping, or the settings of the method")
-        chosen = changed_settings(chosen, changes, f"method={method}: settings")
-    if hypotheses is not None:
-        online = {"online": {"hypotheses": hypotheses}}
-        chosen = changed_settings(chosen, online, "method")
+    for change in changes:
+        if dataclasses.is_dataclass(change) and not isinstance(change, type):
+            chosen = change
+        elif change is not None:
+            require_instance(
+                "settings", change, Mapping, "a mapping, or the settings of the method"
+            )
+            chosen = changed_settings(chosen, change, f"method={method}: settings")
     return chosen

@@ -7,7 +7,7 @@ import subprocess
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from replay.events import SessionStarted
+from chsel.events import SessionStarted
 from replay.startup import package_version
 
 PACKAGES = (

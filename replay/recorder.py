@@ -2,28 +2,39 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 from chsel.errors import RecordingError
-from replay.events import Event, Recorder
+from chsel.events import Event, Recorder
+from replay.mcap.writer import McapRecorder
 
 _MOST = 64  # events that wait for their turn, or to be drawn
+# What Rerun itself would print of a failing disk, over several lines; one line of ours says it.
+_LOG_FILTER = "error,re_log_encoding=off,re_sdk=off"
 
 
-class ListRecorder(Recorder):
-    """Keeps the events in `events`."""
+def open_recorder(mcap: Path | None, rerun: Path | None = None, *, live: bool = False) -> Recorder:
+    """A recorder to an MCAP file, a Rerun recording, or both; live: to the Rerun viewer, too.
 
-    def __init__(self) -> None:
-        self.events: list[Event] = []
+    The session waits for the MCAP file, the full record, and not for the pictures; beside that
+    file, pictures that cannot be written are a warning. Raises RecordingError if a file exists.
+    """
+    files = [] if mcap is None else [McapRecorder(mcap)]
+    pictures: Recorder | None = None
+    if rerun is not None or live:
+        os.environ.setdefault("RUST_LOG", _LOG_FILTER)  # read once, when Rerun is imported
+        from replay.rerun.rerun_recorder import RerunRecorder
 
-    def record(self, event: Event) -> None:
-        """Keep it."""
-        self.events.append(event)
+        pictures = RerunRecorder(rerun, live=live)
+    optional = "" if mcap is None else "`replay view` makes it anew"
+    return Recorders(files, pictures, live=live, optional=optional)
 
 
 class Recorders(Recorder):

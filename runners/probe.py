@@ -16,22 +16,24 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from chsel.errors import RecordingError
+from chsel.events import SessionStarted
 from chsel.methods import build_method
 from chsel.methods.method import Method
 from chsel.numerics.compiler import watched
 from chsel.numerics.threads import set_threads
 from chsel.problem.settings import build_settings
+from chsel.registration import symmetry_for_errors
 from chsel.rehearsal import warm_up, warm_up_policy, warm_up_sensing
+from chsel.session import Session
 from replay.console import Console
-from replay.events import Logged, Recorder, SessionEnded, SessionStarted
 from replay.files import WritingError, file_digest
-from replay.registration import symmetry_for_errors
+from replay.recorder import open_recorder
 from runners.command.choices import calls_for_anchored
 from runners.command.program import command, plain
 from runners.run.display import Display, compiling_line
-from runners.run.recording import make_run_folder, open_recorder, write_in_run_folder
+from runners.run.recording import make_run_folder, write_in_run_folder
 from runners.run.scene import ProbeConfig, Scene, open_scene, session_started
-from runners.run.session_run import Row, SessionRun
+from runners.run.session_run import Row, steps
 
 
 @command("probe")
@@ -115,31 +117,33 @@ def run(
         display.say(f"object: {started.object}")
     steering = scene.steering
     display.probes(scene.session.count if steering is None else steering.policy.settings.probes)
-    recorder = open_recorder(folder, config.recording)
-    session_run = SessionRun(
-        scene.session,
-        scene.online(method.online, config.seed),
+    settings = config.recording
+    session = Session.begun(
+        started,
         method,
-        recorder,
+        open_recorder(
+            folder / "recording.mcap" if settings.mcap else None,
+            folder / "recording.rrd" if settings.rerun else None,
+            live=settings.live,
+        ),
+        online=scene.online(method.online, config.seed),
         symmetry=symmetry_for_errors(started),
-        recording=config.recording,
-        show=lambda *_: interrupt.check(),
-        opening=scene.warnings,
         steering=steering,
+        opening=scene.warnings,
+        snapshot_interval=settings.snapshot_interval,
+        show=lambda *_: interrupt.check(),
     )
     display.warn(scene.warnings)
     rows: list[Row] = []
     outcome = "finished"
     try:
         try:
-            recorder.record(started)
-            recorder.flush()
-            for _, row in session_run.steps():
+            for row in steps(session, scene.session, timings=settings.timings):
                 rows.append(row)
                 display.probe(row)
-                display.warn(session_run.warnings)
+                display.warn(session.warnings)
                 interrupt.check()
-            display.warn(session_run.warnings)
+            display.warn(session.warnings)
         except KeyboardInterrupt:
             outcome = "interrupted"
         except SystemExit:  # the reader of the output has closed it
@@ -150,13 +154,13 @@ def run(
             raise
         finally:
             with _first_error_alone(outcome):
-                _end(recorder, session_run.step, outcome)
+                session.close(outcome)
     except RecordingError as error:
         outcome = f"failed: {error}"
         raise
     finally:
         with _first_error_alone(outcome):
-            _summarise(folder, scene, started, session_run, rows, outcome)
+            _summarise(folder, scene, session, rows, outcome)
     if scene.report is not None:
         display.sensed(scene.report)
     display.table(rows)
@@ -166,7 +170,7 @@ def run(
         display.stopped(steering)
     display.written(folder)
     display.pose(rows)
-    display.verdict(session_run.trust)
+    display.verdict(session.trust)
     return outcome == "interrupted"
 
 
@@ -177,26 +181,9 @@ def _first_error_alone(outcome: str) -> suppress | nullcontext[None]:
     return suppress(OSError, RecordingError, WritingError)
 
 
-def _end(recorder: Recorder, step: int, outcome: str) -> None:
-    """End the recording."""
-    level = "info" if outcome == "finished" else "warning"
-    try:
-        recorder.record(Logged(step, level, f"session {outcome}"))
-        recorder.record(SessionEnded(step, outcome))
-    finally:
-        recorder.close()
-
-
-def _summarise(
-    folder: Path,
-    scene: Scene,
-    started: SessionStarted,
-    session_run: SessionRun,
-    rows: list[Row],
-    outcome: str,
-) -> None:
+def _summarise(folder: Path, scene: Scene, session: Session, rows: list[Row], outcome: str) -> None:
     """Write the outcome, warnings, and the numbers of every step, times included."""
-    trust, recording = session_run.trust, folder / "recording.mcap"
+    started, trust, recording = session.started, session.trust, folder / "recording.mcap"
     sensors = scene.report.total().items() if scene.report else ()
     names = ("runner", "object", "session", "method", "seed")
     summary = {
@@ -204,7 +191,7 @@ def _summarise(
         "outcome": outcome,
         "recording_digest": file_digest(recording) if recording.is_file() else None,
         "trust": None if trust is None else asdict(trust),  # of the last result
-        "warnings": [asdict(warning) for warning in session_run.warnings],
+        "warnings": [asdict(warning) for warning in session.warnings],
         "sensors": {name: asdict(counts) for name, counts in sensors},
         "steps": rows,
         "environment": dict(started.environment),

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isqrt
+from math import isqrt, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import label, minimum_filter
+from scipy.ndimage import binary_erosion, label, minimum_filter
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from chsel.errors import PointsError, SettingError, require_positive
-from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.errors import PointsError, PoseError, SettingError, require_positive
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, frozen
+from chsel.problem.points import Lattice
+from chsel.problem.poses import apply, nearest_rigid
 
 MOST_PIXELS = 100_000  # on a side
 _STEEPEST = 4.0  # tangent of the angle between a surface's normal and the ray: 76 degrees
 _SPACINGS = 4.0  # random points on a surface are one region up to so many typical distances
 _MOST_ASKED = 2000  # points whose nearest neighbours give the typical distance
+_JUMP = 0.02  # m: between neighbouring pixels of different surfaces
+_REGION_JUMP = 0.01  # share of the depth: the same within a mask
+_PART = 0.05  # of the largest region of a mask: smaller ones are left out
+_OUTLINE = 2  # pixels by which a mask may be off
 
 
 @dataclass(frozen=True)
@@ -209,3 +215,76 @@ def _linked(one: FloatArray, other: FloatArray, share: float) -> BoolArray:
     """Whether pairs of depths are connected; none is with 0."""
     nearer = np.minimum(one, other)
     return (nearer > 0.0) & (np.abs(one - other) <= share * nearer)
+
+
+class DepthLook(NamedTuple):
+    """What a depth image shows."""
+
+    camera: PinholeCamera
+    pose: FloatArray  # (4, 4), world_from_camera
+    depth: FloatArray  # (H, W), metres, 0 where there is none
+    ends: FloatArray  # (H, W), metres: depths up to which rays are free
+    rays: BoolArray  # (H, W): pixels whose rays count
+    surface: FloatArray  # (M, 3): points on the object, world
+
+
+def depth_look(
+    depth: Any,
+    camera: PinholeCamera,
+    world_from_camera: Any,
+    mask: Any = None,
+    *,
+    before: float,
+    side: float,
+) -> DepthLook:
+    """The free rays of a depth image, and points of what a mask (H, W) says is the object.
+
+    before: metres that rays end before what they see. side: of voxels of which each gives one point
+    at most, metres. Pixels beside jumps of depth, at the mask's outline and in its small regions
+    are left out. Raises PointsError for an image without a depth, or a mask without a pixel left.
+    """
+    pose = frozen("world_from_camera", world_from_camera, (4, 4), error=PoseError)
+    pose = nearest_rigid("world_from_camera", pose[None])[0]
+    valid = valid_pixels(camera.image("depth", depth), nearest=0.0, furthest=np.inf)
+    if not valid.any():
+        raise PointsError("depth has no measurement; accepted: metres above 0")
+    depth = np.where(valid, depth, 0.0)
+    rays = valid & ~occlusion_edges(depth, valid, _JUMP)
+    surface = np.zeros((0, 3))
+    if mask is not None:
+        mask = camera.image("mask", mask, bool)
+        within = binary_erosion(mask, np.ones((3, 3)), iterations=_OUTLINE, border_value=1)
+        on_object = within & rays
+        regions = depth_regions(depth, on_object, camera, _REGION_JUMP)
+        on_object[on_object] = main_regions(regions[on_object], part=_PART).kept
+        if not on_object.any():
+            raise PointsError(
+                f"none of the {int(mask.sum())} pixels of mask is on a surface; accepted: a mask "
+                "with pixels of a measured depth, inside of its outline"
+            )
+        surface = one_per_voxel(apply(pose, camera.back_project(depth)[on_object]), side)
+        rays &= on_object | ~mask
+    return DepthLook(camera, pose, depth, np.maximum(depth - before, 0.0), rays, surface)
+
+
+def one_per_voxel(points: FloatArray, side: float) -> FloatArray:
+    """Of points (N, 3), those nearest to the centre of their voxel (M, 3), in the given order."""
+    lattice = Lattice((0.0, 0.0, 0.0), side)
+    voxels = lattice.voxels(points)
+    distance = ((points - lattice.centres(voxels)) ** 2).sum(axis=1)
+    nearest_first = np.argsort(distance, kind="stable")
+    _, first = np.unique(voxels[nearest_first], axis=0, return_index=True)
+    return points[np.sort(nearest_first[first])]
+
+
+def outside_of(on_object: FloatArray, free: FloatArray, spacing: float) -> FloatArray:
+    """Free centres (N, 3) but for those that a measured surface point can lie behind.
+
+    A ray that passes a voxel passes its centre at up to half the voxel's diagonal, so that nearer
+    to the surface than this a centre may be inside the object.
+    """
+    if len(on_object) == 0 or len(free) == 0:
+        return free
+    margin = sqrt(0.75) * spacing
+    nearest = cKDTree(on_object).query(free, distance_upper_bound=margin)[0]
+    return free[~(nearest <= margin)]

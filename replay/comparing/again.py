@@ -6,13 +6,12 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from chsel.errors import ChselError
-from chsel.policies.steering import Choice, Steering
-from chsel.problem.registration_problem import Hypotheses
-from replay.comparing.choices import recorded_method, recorded_policy
-from replay.events import (
+from chsel.events import (
+    ActionsOffered,
     Decided,
     Event,
     HypothesesFound,
+    ListRecorder,
     Logged,
     Measured,
     Probe,
@@ -20,15 +19,14 @@ from replay.events import (
     SnapshotTaken,
     Traced,
 )
+from chsel.methods.method import Method
+from chsel.policies.steering import Choice, Steering
+from chsel.problem.online_registration import OnlineRegistration
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
+from chsel.registration import register_recorded, symmetry_for_errors
+from replay.comparing.choices import recorded_method, recorded_policy
 from replay.mcap.reader import Recording
 from replay.mcap.recovery import tells_loss
-from replay.recorder import ListRecorder
-from replay.registration import (
-    recorded_online,
-    register_recorded,
-    snapshot_interval,
-    symmetry_for_errors,
-)
 
 _RESULTS = (SnapshotTaken, Traced, HypothesesFound, Measured)  # of a registration
 _KEPT = (ProblemPosed, HypothesesFound)  # what is compared where others may be lost
@@ -94,6 +92,25 @@ def made_again(
     yield from session.registered(group)
 
 
+def recorded_online(recording: Recording, method: Method) -> OnlineRegistration:
+    """The loop that a recorded session walks with a method, before its first step."""
+    start = recording.start
+    return OnlineRegistration(
+        start.sdf,
+        start.workspace,
+        start.free_resolution,
+        method.online,
+        seed=recording.seed,
+        points=start.initial_points,
+    )
+
+
+def snapshot_interval(snapshots: Sequence[ArchiveSnapshot]) -> int:
+    """Iterations between recorded snapshots; 0 if there are the first and the last alone."""
+    iterations = sorted({archive.iteration for archive in snapshots})
+    return iterations[1] if len(iterations) > 2 else 0
+
+
 class _SessionAgain:
     """Where a session stands that is made again."""
 
@@ -108,20 +125,23 @@ class _SessionAgain:
         self._result_known = True
         self._surprise: float | None = 0.0  # of the last probe, None if it cannot be known
         self._before: Decided | None = None
-        start, offered = recording.start, recording.offered
-        if offered is not None:
+        if recording.offered is not None:
             self._policy = recorded_policy(recording)
-            given = (start.sdf, start.workspace, start.free_resolution)
-            self._steering = Steering(self._policy.build(), *given, offered.actions, offered.hand)
 
     def perceived(self, event: Event) -> None:
         """Take note of losses, of new points, and of an outcome that surprises."""
         self._lost = self._lost or tells_loss(event)
+        if isinstance(event, ActionsOffered):
+            start = self._recording.start
+            given = (start.sdf, start.workspace, start.free_resolution)
+            self._steering = Steering(self._policy.build(), *given, event.actions, event.hand)
         if not isinstance(event, Probe):
             return
         self._online.points = self._online.points.merged(event.new_points)
         before, self._surprise = self._before, None
         if before is None or before.step != event.step - 1 or before.decision.chosen < 0:
+            return
+        if event.outcome == "points":  # not of the hand
             return
         if len(before.decision.contacts) != len(before.problem.belief):
             return  # of a policy without forecasts

@@ -16,6 +16,7 @@ import pandas as pd
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.errors import ChselError, RecordingError, require_choice
+from chsel.events import ProblemPosed, Recorder, SessionEnded, SessionStarted
 from chsel.methods.method import Method
 from chsel.plausible.plausible_set import PlausibleSet, read_plausible
 from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
@@ -25,19 +26,14 @@ from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.settings import PRESETS, in_preset
 from chsel.problem.streams import StreamKey
+from chsel.registration import Registered, register_recorded, symmetry_for_errors
 from chsel.rehearsal import warm_up
+from replay.comparing.again import snapshot_interval
 from replay.comparing.choices import Choice, is_recorded, recorded_method
 from replay.environment import environment
-from replay.events import ProblemPosed, Recorder, SessionEnded, SessionStarted
 from replay.files import file_digest, new_file
 from replay.mcap.reader import Recording
 from replay.mcap.writer import McapRecorder
-from replay.registration import (
-    Registered,
-    register_recorded,
-    snapshot_interval,
-    symmetry_for_errors,
-)
 
 
 class Column(NamedTuple):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.events import (
+from chsel.events import (
     Decided,
     Event,
     HypothesesFound,

@@ -15,14 +15,7 @@ import numpy as np
 import zstandard
 
 from chsel.errors import RecordingError
-from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
-from chsel.numerics.arrays import digest
-from chsel.problem.mesh import mesh_digest
-from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.registration_problem import ArchiveSnapshot, RegistrationProblem
-from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.streams import StreamKey
-from replay.events import (
+from chsel.events import (
     ActionsOffered,
     Decided,
     Event,
@@ -32,6 +25,13 @@ from replay.events import (
     SessionStarted,
     SnapshotTaken,
 )
+from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
+from chsel.numerics.arrays import digest
+from chsel.problem.mesh import mesh_digest
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.registration_problem import ArchiveSnapshot, RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
 from replay.mcap.encoding import check_message, shared_arguments, shared_values
 from replay.mcap.schemas import FORMAT_VERSION, RECORDS
 from replay.mcap.validation import check_digest

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import RecordingError
+from chsel.events import Event, HypothesesFound, Logged, Probe, SessionStarted, SnapshotTaken
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
-from replay.events import Event, HypothesesFound, Logged, Probe, SessionStarted, SnapshotTaken
 from replay.mcap.attachments import mesh_attached, sdf_attached
 from replay.mcap.encoding import check_message, decode, message_class, parsed, shared_arguments
 from replay.mcap.event_messages import (

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from chsel.errors import ChselError, RecordingError
-from chsel.problem.points import KnownPoints
-from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from replay.events import (
+from chsel.events import (
     ActionsOffered,
     Decided,
     Event,
@@ -24,6 +22,8 @@ from replay.events import (
     SessionStarted,
     SnapshotTaken,
 )
+from chsel.problem.points import KnownPoints
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from replay.files import file_digest
 from replay.mcap.encoding import decode
 from replay.mcap.event_messages import ImagePlace, RecordedDecision, RecordedProblem, image_from
@@ -42,9 +42,9 @@ class Recording:
     path: of the file. damage: what cut reading short, None if the file is whole. start: how the
     session began. ended: how it ended, None if it did not. probes: in their order. steps: those
     with a registration problem. rig: of a recorded robot session, else None. image_steps: those
-    with images of sensors. offered: the actions of a steered session, else None. decision_steps:
-    those that a decision follows, -1 for that before the first probe. attachments: bytes of each,
-    by name.
+    with images of sensors. offered: the first actions of a steered session, else None.
+    decision_steps: those that a decision follows, -1 for that before the first probe. attachments:
+    bytes of each, by name.
     """
 
     def __init__(
@@ -74,14 +74,16 @@ class Recording:
         Images are read from the file once more, one at a time, or left out.
         """
         points = self.start.initial_points
-        seen = self._images()
+        seen, offered = self._images(), self.offered
         for entry in self._entries:
             if isinstance(entry, Probe):
                 points = points.merged(entry.new_points)
+            if isinstance(entry, ActionsOffered):
+                offered = entry
             if isinstance(entry, RecordedProblem):
                 yield ProblemPosed(entry.step, self._completed(entry, points))
             elif isinstance(entry, RecordedDecision):
-                yield self._decided(entry, points)
+                yield self._decided(entry, offered, points)
             elif not isinstance(entry, ImagePlace):
                 yield entry
             elif images:
@@ -103,7 +105,9 @@ class Recording:
         """The decision that follows a step, with its problem, whose digest is checked."""
         self._check_step(step, self.decision_steps, "decision")
         entry, points = self._found(RecordedDecision, step)
-        return self._decided(entry, points)
+        before = self._entries[: self._entries.index(entry)]
+        offered = [each for each in before if isinstance(each, ActionsOffered)]
+        return self._decided(entry, offered[-1], points)
 
     def checked_steps(self, steps: Sequence[int] | None) -> tuple[int, ...]:
         """Steps with a registration problem, in order; None means all. RecordingError if not."""
@@ -182,10 +186,12 @@ class Recording:
         assert isinstance(entry, kind)
         return entry, points
 
-    def _decided(self, entry: RecordedDecision, points: KnownPoints) -> Decided:
-        assert self.offered is not None  # as the decision was read
+    def _decided(
+        self, entry: RecordedDecision, offered: ActionsOffered | None, points: KnownPoints
+    ) -> Decided:
+        assert offered is not None  # as the decision was read
         with _blaming(self.path):
-            return entry.completed(self.start, self.offered, points)
+            return entry.completed(self.start, offered, points)
 
     def _completed(self, entry: RecordedProblem, points: KnownPoints) -> RegistrationProblem:
         with _blaming(self.path):

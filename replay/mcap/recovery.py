@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from chsel.errors import ChselError, RecordingError
-from chsel.problem.points import KnownPoints
-from chsel.problem.sdf_grid import object_grid
-from replay.events import (
+from chsel.events import (
     ActionsOffered,
     Event,
     HypothesesFound,
@@ -22,6 +20,8 @@ from replay.events import (
     SessionEnded,
     SessionStarted,
 )
+from chsel.problem.points import KnownPoints
+from chsel.problem.sdf_grid import object_grid
 from replay.files import new_file
 from replay.mcap.attachments import mesh_attached, sdf_attached, sdf_to_bytes
 from replay.mcap.encoding import decode

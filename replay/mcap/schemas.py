@@ -1,6 +1,6 @@
 """The messages of a recording that are the project's own, and the topics that carry them.
 
-An event of `replay.events` that names its topic is written, read, checked, compared and exported
+An event of `chsel.events` that names its topic is written, read, checked, compared and exported
 as its message here says. A new field or event stands in its class and in this table.
 """
 

@@ -281,17 +281,13 @@ class EventOrder:
                     )
                 self.has_rig = True
             case "/sensor_image":
-                if not self.has_rig:
-                    raise RecordingError(f"an image of step {step} has no rig before it")
                 if step <= self._probe:
                     raise RecordingError(
                         f"an image of step {step} does not precede the probe of its step"
                     )
             case "/actions":
-                if self.has_actions or step != _BEFORE_ALL_STEPS:
-                    raise RecordingError(
-                        f"actions are offered in step {step}; accepted: once, before all steps"
-                    )
+                if step == self._decided:
+                    raise RecordingError(f"the actions of step {step} follow its decision")
                 self.has_actions = True
             case "/decision":
                 self._check_decision(step)

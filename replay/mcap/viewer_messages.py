@@ -24,13 +24,13 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 
+from chsel.events import Decided, Event, HypothesesFound, Probe, SessionStarted
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse, quaternions
 from chsel.problem.registration_problem import Hypotheses
 from replay.colors import CONTACT, FREE, OCCUPIED, ColorArray, cost_colors
 from replay.colors import OBJECT as OBJECT_COLOR
-from replay.events import Decided, Event, HypothesesFound, Probe, SessionStarted
 from replay.mcap.foxglove_messages import (
     LEVELS,
     POINT_CLASSES,

@@ -13,11 +13,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from chsel.errors import RecordingError
-from chsel.next_probe.decision_problem import DecisionProblem
-from chsel.numerics.arrays import FloatArray, digest
-from chsel.problem.points import KnownPoints
-from chsel.problem.registration_problem import RegistrationProblem
-from replay.events import (
+from chsel.events import (
     ActionsOffered,
     Decided,
     Event,
@@ -30,6 +26,10 @@ from replay.events import (
     SessionStarted,
     SnapshotTaken,
 )
+from chsel.next_probe.decision_problem import DecisionProblem
+from chsel.numerics.arrays import FloatArray, digest
+from chsel.problem.points import KnownPoints
+from chsel.problem.registration_problem import RegistrationProblem
 from replay.files import sync_folder
 from replay.mcap.attachments import MEDIA_TYPES, mesh_to_ply, sdf_to_bytes
 from replay.mcap.encoding import (

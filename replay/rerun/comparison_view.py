@@ -14,12 +14,12 @@ import rerun.blueprint as rrb
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import RecordingError
+from chsel.events import Probe, ProblemPosed
 from chsel.problem.points import Workspace
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.trust import has_pose, trust_in
 from replay.colors import SERIES, CostScale, number
 from replay.comparing.comparison import CommonCost, common_cost, numbers_under
-from replay.events import Probe, ProblemPosed
 from replay.mcap.reader import Recording
 from replay.rerun.curves import DEGREES, MILLIMETRES, style_curve
 from replay.rerun.scene import HypothesisMeshes, Scene, coarsened, shown_hypotheses

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import rerun as rr
 
+from chsel.events import Traced
 from chsel.problem.registration_problem import Hypotheses
 from replay.colors import COSTS, SERIES, Rgb
-from replay.events import Traced
 from replay.rerun.stream import ITERATION
 
 MILLIMETRES, DEGREES = 1e3, math.degrees(1.0)

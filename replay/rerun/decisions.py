@@ -13,8 +13,8 @@ from replay.rerun.curves import MILLIMETRES, Curves
 from replay.rerun.scene import on_screen
 
 if TYPE_CHECKING:
+    from chsel.events import Decided, Probe
     from chsel.next_probe.decision_problem import Actions
-    from replay.events import Decided, Probe
 
 _ARROW = 0.06  # longest arrow of an action, in diagonals of the box around all their starts
 _WIDTHS = (0.75, 0.35)  # radii of the arrows of actions that can be taken and that cannot, points

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import rerun as rr
 
+from chsel import events
 from chsel.errors import RecordingError
-from replay import events
+from chsel.events import Recorder
 from replay.colors import number
-from replay.events import Recorder
 from replay.files import require_new
 from replay.mcap.event_messages import step_numbers
 from replay.mcap.reader import Recording

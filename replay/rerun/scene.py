@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import rerun as rr
 
+from chsel.events import Probe
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import inverse
@@ -26,7 +27,6 @@ from replay.colors import (
     Rgb,
     cost_colors,
 )
-from replay.events import Probe
 from replay.mcap.viewer_messages import simple_mesh
 
 if TYPE_CHECKING:

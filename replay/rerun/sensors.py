@@ -8,8 +8,8 @@ import numpy as np
 import rerun as rr
 from rerun.components import Colormap
 
+from chsel.events import SensorImage
 from replay.colors import BACKGROUND, CAMERA, CONTACT
-from replay.events import SensorImage
 
 DEFORMATION = "deformation"
 _LONGEST_SIDE = 320  # pixels of a picture: of larger images, every so many rows and columns

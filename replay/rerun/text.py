@@ -9,10 +9,10 @@ from typing import Any
 
 import yaml
 
+from chsel.events import SessionStarted
 from chsel.problem.noise import FREEDOMS
 from chsel.problem.registration_problem import VERDICTS, Hypotheses, Trust
 from replay.colors import CostScale, number
-from replay.events import SessionStarted
 from replay.rerun.scene import shown_hypotheses
 
 COLORS = """

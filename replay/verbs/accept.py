@@ -15,6 +15,7 @@ from pathlib import Path
 from rich.table import Table
 
 from chsel.errors import RecordingError
+from chsel.events import Event, HypothesesFound, Measured, SessionStarted, Timed
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
 from chsel.problem.poses import inverse
@@ -24,7 +25,6 @@ from replay.comparing.comparison import PlausibleSets
 from replay.comparing.verification import DIFFERS, Verdict, recordings_in
 from replay.console import Console, plain_table
 from replay.environment import environment, environment_differences
-from replay.events import Event, HypothesesFound, Measured, SessionStarted, Timed
 from replay.files import sync_folder
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.recovery import tells_loss

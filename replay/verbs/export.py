@@ -20,12 +20,12 @@ import pandas as pd
 from rich.filesize import decimal
 
 from chsel.errors import RecordingError, SettingError
+from chsel.events import SensorImage
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import inverse, quaternions
 from chsel.problem.registration_problem import ArchiveSnapshot
 from replay.arguments import STEPS_HELP, chosen_steps, path_argument
 from replay.console import Console
-from replay.events import SensorImage
 from replay.files import new_file
 from replay.mcap.event_messages import step_numbers
 from replay.mcap.foxglove_messages import POINT_CLASSES
@@ -199,8 +199,9 @@ def exported_decisions(recording: Recording, steps: str | None) -> Exported:
     of probe K; `step_K/poses` (P, 4, 4), object_from_world, and `step_K/weights` (P,) of the
     belief; `step_K/available` (A,), `step_K/score` (A,), `step_K/hit_chance` (A,),
     `step_K/blocked_chance` (A,), `step_K/expected_spread` (A,), metres; `step_K/contacts` (P, 3),
-    where the chosen action meets the object in each pose, NaN where it does not. Table: a row a
-    decision; x, y, z (metres) are the start of the chosen action, dx, dy, dz its direction.
+    where the chosen action meets the object in each pose, NaN where it does not; where other
+    actions were offered than at first, `step_K/world_from_hand` (A, 4, 4). Table: a row a decision;
+    x, y, z (metres) are the start of the chosen action, dx, dy, dz its direction.
     """
     chosen = _chosen(recording, steps, recording.decision_steps, "decision")
     assert recording.offered is not None  # as there is a decision
@@ -219,6 +220,8 @@ def exported_decisions(recording: Recording, steps: str | None) -> Exported:
         problem, decision = decided.problem, decided.decision
         parts = {name: getattr(decision, name) for name in _OF_DECISIONS}
         parts |= {"surprise": decided.surprise, "available": problem.available}
+        if problem.actions.digest != actions.digest:
+            parts["world_from_hand"] = problem.actions.world_from_hand
         parts |= {"poses": problem.belief.object_from_world, "weights": problem.belief.weights}
         arrays |= {f"step_{step}/{name}": part for name, part in parts.items()}
         numbers = np.full(6 + len(_OF_ACTIONS), np.nan)  # without an action

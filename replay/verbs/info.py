@@ -22,9 +22,9 @@ from rich.filesize import decimal
 from rich.table import Table
 
 from chsel.errors import RecordingError, SessionError
+from chsel.events import Decided, Probe
 from chsel.problem.mesh import mesh_digest
 from replay.console import Console, plain_table, print_error
-from replay.events import Decided, Probe
 from replay.mcap.file import MALFORMED, McapFile, recover_hint
 from replay.mcap.foxglove_messages import TOPIC_SCHEMAS
 from replay.mcap.log_file import ROS1_BAG, Channel, RawFile

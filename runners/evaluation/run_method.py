@@ -23,6 +23,7 @@ from chsel.problem.search_space import search_space
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.qd.selection import ranked, repeated, select_elites
 from chsel.rehearsal import warm_up
+from chsel.session import Session
 from replay.environment import environment
 from replay.files import file_digest
 from runners.evaluation.contenders import MOST_REPEATS, Contender, repeat_label, repeat_seed
@@ -36,8 +37,7 @@ from runners.evaluation.trial_session import (
     problems,
     read_told,
 )
-from runners.run.recording import RecordingConfig
-from runners.run.session_run import SessionRun
+from runners.run.session_run import steps
 from runners.sessions.recorded import RecordedSession
 
 REPEAT_FOLDER = "draw_{}"
@@ -197,36 +197,37 @@ def method_rows(
         # Problems of another method do not follow from the results of this one.
         source="" if leader is None else file_digest(trial.folder(plan) / "session.mcap"),
     )
-    recorder.record(started)
     only = chosen if leader is None else None
     online = (leader or method).online
-    run = SessionRun(
-        session,
-        session.online(online, repeat_seed(trial.seed, contender.draw), only=only),
+    run = Session.begun(
+        started,
         method,
         recorder,
+        online=session.online(online, repeat_seed(trial.seed, contender.draw), only=only),
         symmetry=object_symmetry(session.recorded.mesh),
-        recording=RecordingConfig(snapshot_interval=plan.every or 0),
-        show=lambda *_: None,
+        snapshot_interval=plan.every or 0,
     )
 
-    def register_and_lead(problem: RegistrationProblem) -> Hypotheses:
-        """The leader's result, which the next problem follows from."""
+    def register_and_lead(run: Session) -> None:
+        """Remember the leader's result, which the next problem follows from."""
         assert leader is not None
-        if problem.key.step in chosen:
+        problem = run.online.pose(run.step)
+        if run.step in chosen:
             try:
-                run.register(problem)
+                run.register_problem(problem)
             except Exception as error:
-                run.failed(problem.key.step, error)
-        return leader.register(problem)
+                run.failed(error)
+        run.online.remember(leader.register(problem))
 
-    steps = run.steps(catch=Exception) if leader is None else run.steps(register_and_lead)
+    walked = steps(run, session, catch=Exception)
+    if leader is not None:
+        walked = steps(run, session, register=register_and_lead)
     holds = getattr(method, "holds", None)
     result_rows = ResultRows(plan, trial, session, contender.label, holds)
     rows, iterations = list[Row](), list[Row]()
-    for step, _ in steps:
-        problem = step.problem
-        if problem is None or step.step not in chosen:
+    for _ in walked:
+        problem = run.problem
+        if problem is None or run.step not in chosen:
             continue
         if run.registered is None:
             rows.append(result_rows.row(problem, None, run.failure))

@@ -13,18 +13,19 @@ from chsel.numerics.arrays import FloatArray
 from chsel.plausible.symmetry import object_symmetry
 from chsel.policies.policy import PolicySettings, StopSettings
 from chsel.problem import surface
-from chsel.problem.online_registration import OnlineRegistration, OnlineStep
+from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.poses import Poses, inverse
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from chsel.rehearsal import warm_up, warm_up_policy
+from chsel.session import Session
 from runners.evaluation.contenders import Contender
 from runners.evaluation.experiment import Row
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.trial_session import StepRecorder, config_values, probe_config
 from runners.run.recording import RecordingConfig
 from runners.run.scene import Scene, open_scene, session_started
-from runners.run.session_run import SessionRun
+from runners.run.session_run import steps
 
 
 def policy_rows(
@@ -39,21 +40,18 @@ def policy_rows(
     scene, rows = open_scene(config), list[Row]()
     try:
         started = session_started(config, config_values(config), registering.name, scene)
-        recorder.record(replace(started, runner="evaluate"))
-        online = scene.online(method.online, trial.seed)
-        run = SessionRun(
-            scene.session,
-            online,
+        session = Session.begun(
+            replace(started, runner="evaluate"),
             method,
             recorder,
+            online=scene.online(method.online, trial.seed),
             symmetry=object_symmetry(scene.mesh),
-            recording=RecordingConfig(),
-            show=lambda *_: None,
             steering=scene.steering,
+            snapshot_interval=RecordingConfig.snapshot_interval,
         )
         about = plan.about(trial, contender.label)
-        for step, numbers in run.steps(catch=Exception):
-            rows.append(about | _row(scene, settings, trial.seed, step, numbers, run, online))
+        for numbers in steps(session, scene.session, catch=Exception):
+            rows.append(about | _row(scene, settings, trial.seed, numbers, session))
             if len(rows) >= settings.probes:  # of a session that no policy ends
                 break
     finally:
@@ -65,12 +63,10 @@ def _row(
     scene: Scene,
     settings: PolicySettings,
     seed: int,
-    step: OnlineStep,
     numbers: Row,
-    run: SessionRun,
-    online: OnlineRegistration,
+    session: Session,
 ) -> dict[str, Any]:
-    """What is known after a step. numbers: the run's own row. online: the loop that it walks."""
+    """What is known after a step. numbers: the step's own row."""
     assert scene.session.world_from_object is not None
     truth = Poses.of(inverse(scene.session.world_from_object[None]))
 
@@ -78,13 +74,14 @@ def _row(
         """How far the surface in poses (B, 4, 4), object_from_world, is from the true one (B,)."""
         return surface.outline_distances_to(scene.sdf, Poses.of(poses), truth)
 
-    after, key = None if run.steering is None else run.steering.last, StreamKey(seed, step.step + 1)
+    after, online = None if session.steering is None else session.steering.last, session.online
+    key = StreamKey(seed, session.step + 1)
     belief = _belief(scene, settings, key, online) if after is None else after.problem.belief
     error = surface.in_order(belief.weights * errors(belief.object_from_world))
     row: dict[str, Any] = {
-        "step": step.step,
-        "probes": step.step + 1,
-        "status": f"failed: {run.failure}" if run.failure else "ok",
+        "step": session.step,
+        "probes": session.step + 1,
+        "status": f"failed: {session.failure}" if session.failure else "ok",
         "contacts": numbers["contacts"],
         "free_points": numbers["free_points"],
         "hit": numbers["outcome"] == "contact",
@@ -99,13 +96,13 @@ def _row(
     found = online.previous
     if found is not None and len(found.cost) > 0:
         row["error"] = float(errors(found.object_from_world).mean())
-    if run.registered is not None and step.problem is not None:
-        hypotheses = run.registered.hypotheses
+    if session.registered is not None and session.problem is not None:
+        hypotheses = session.registered.hypotheses
         row |= {
             "hypotheses": len(hypotheses.cost),
             "digest": hypotheses.digest,
-            "problem_digest": step.problem.digest,
-            "seconds": run.registered.total_seconds,
+            "problem_digest": session.problem.digest,
+            "seconds": session.registered.total_seconds,
         }
     if after is None:
         return row | {"stop": usual_stop(row["spread"], None)}

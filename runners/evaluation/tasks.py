@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 from chsel.errors import ChselError, SettingError
 from chsel.numerics.threads import threads
+from chsel.registration import one_line
 from runners.evaluation.experiment import PROBES, RESULTS, part_source, write_part
 from runners.evaluation.plan import Plan, Task, Trial
 from runners.evaluation.run_method import external_digest, external_rows, method_rows
 from runners.evaluation.run_policy import policy_rows
 from runners.evaluation.trial_session import make_session, read_told, recording_in
-from runners.run.session_run import one_line
 
 if TYPE_CHECKING:
     from distributed import Client, Future

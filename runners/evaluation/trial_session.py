@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from chsel.errors import EvaluationError
+from chsel.events import Event, Logged, Probe, Recorder, SessionEnded, SnapshotTaken
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible import plausible_set as sets
 from chsel.plausible.plausible_set import PlausibleSet
 from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import ArchiveSnapshot, RegistrationProblem
-from replay.events import Event, Logged, Probe, Recorder, SessionEnded, SnapshotTaken
 from replay.files import WritingError, whole_file
 from replay.mcap.writer import McapRecorder
 from runners.evaluation.contenders import Contender

@@ -19,8 +19,8 @@ from chsel.numerics.compiler import watched
 from chsel.policies.steering import Steering
 from chsel.problem.poses import quaternions
 from chsel.problem.registration_problem import Trust
+from chsel.session import FROM_SESSION, StepWarning
 from replay.console import Console, Progress, TextColumn, plain_table
-from runners.run.session_run import FROM_SESSION, StepWarning
 from runners.sensors.session_report import Report
 
 MEANINGS = {

@@ -11,13 +11,7 @@ from typing import Annotated
 
 from chsel.errors import RecordingError
 from chsel.problem.settings import CheckedSettings, not_negative
-from replay.events import Recorder
 from replay.files import whole_file
-from replay.mcap.writer import McapRecorder
-from replay.recorder import Recorders
-
-# What Rerun itself would print of a failing disk, over several lines; one line of ours says it.
-_LOG_FILTER = "error,re_log_encoding=off,re_sdk=off"
 
 
 @dataclass(frozen=True)
@@ -54,21 +48,3 @@ def write_in_run_folder(path: Path, text: str) -> None:
     """Write a file of a run. Raises WritingError, which names it, if that cannot be done."""
     with whole_file(path, "a logs=DIR that can be written") as beside:
         beside.write_text(text)
-
-
-def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:
-    """A recorder to all files that `config` asks for.
-
-    The run waits for the MCAP file, the full record, and not for the pictures; beside that file,
-    pictures that cannot be written are a warning.
-    """
-    files = [McapRecorder(folder / "recording.mcap")] if config.mcap else []
-    pictures: Recorder | None = None
-    if config.rerun or config.live:
-        os.environ.setdefault("RUST_LOG", _LOG_FILTER)  # read once, when Rerun is imported
-        from replay.rerun.rerun_recorder import RerunRecorder
-
-        path = folder / "recording.rrd" if config.rerun else None
-        pictures = RerunRecorder(path, live=config.live)
-    optional = "`replay view` makes it anew" if config.mcap else ""
-    return Recorders(files, pictures, live=config.live, optional=optional)

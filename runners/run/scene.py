@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from chsel.errors import InputWarning, SessionError
+from chsel.events import SessionStarted
 from chsel.numerics.threads import require_threads
 from chsel.policies import build_policy
 from chsel.policies.steering import Steering
@@ -15,7 +16,6 @@ from chsel.problem.online_registration import OnlineRegistration, OnlineSettings
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from replay.environment import environment
-from replay.events import SessionStarted
 from runners.objects.loader import ObjectConfig, ObjectModel, check_size, load_object
 from runners.objects.scans import AssetsConfig
 from runners.run.recording import RecordingConfig
@@ -23,7 +23,7 @@ from runners.sensors.session_report import Report
 from runners.sessions import open_session, session_settings
 from runners.sessions.probing_settings import without_defaults
 from runners.sessions.recorded import RecordedSession
-from runners.sessions.session import Session, Steerable
+from runners.sessions.source import ProbeSource, Steerable
 
 if TYPE_CHECKING:
     import trimesh
@@ -68,7 +68,7 @@ class ProbeConfig:
 class Scene:
     """The session and the object that it hides."""
 
-    session: Session
+    session: ProbeSource
     object_name: str
     mesh: trimesh.Trimesh
     sdf: SdfGrid
@@ -106,7 +106,7 @@ def open_scene(config: ProbeConfig) -> Scene:
     policy_name = str(values.pop("name", None))
     policy = build_policy(policy_name, values)
     found: list[InputWarning] = []
-    session: Session
+    session: ProbeSource
     if kind == "recorded":
         session = RecordedSession(settings)
         of, start = session.recorded, session.start

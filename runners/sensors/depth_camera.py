@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from chsel.events import SensorImage
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.sensing.depth_camera import (
     PinholeCamera,
@@ -16,7 +17,6 @@ from chsel.sensing.depth_camera import (
     valid_pixels,
 )
 from chsel.sensing.free_space import FreeGrid
-from replay.events import SensorImage
 from runners.sensors.cell import RobotCell
 from runners.sensors.log.messages import ImageMessage
 from runners.sensors.rig import CameraRig, GateRig, ImageRig

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from math import sqrt
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from scipy.ndimage import binary_erosion
-from scipy.spatial import cKDTree
 
 from chsel.errors import ChselError, SessionError, SettingError
 from chsel.numerics.arrays import BoolArray, FloatArray
-from chsel.problem.points import KnownPoints, Lattice, Workspace
+from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import apply
 from chsel.problem.settings import CheckedSettings, build_settings, not_negative, positive
-from chsel.sensing.depth_camera import PinholeCamera, depth_regions, main_regions, valid_pixels
+from chsel.sensing.depth_camera import (
+    PinholeCamera,
+    depth_regions,
+    main_regions,
+    one_per_voxel,
+    outside_of,
+    valid_pixels,
+)
 from chsel.sensing.free_space import FreeGrid
 from runners.sensors.depth_camera import View, edge_pixels, mark_rays, metres
 from runners.sensors.log.images import read_image
@@ -182,21 +187,11 @@ def depth_frame_points(
     _, small = mark_rays(grid, camera, rig.gate, view, rays)
     counts.small += small
     points = KnownPoints(
-        free=_outside_of(on_object, grid.new(), free_resolution),
+        free=outside_of(on_object, grid.new(), free_resolution),
         known=one_per_voxel(on_object, rig.surface_resolution),
     )
     counts.contacts, counts.free = len(points.known), len(points.free)
     return FramePoints(points, workspace, rays, surface, counts, labelled)
-
-
-def one_per_voxel(points: FloatArray, side: float) -> FloatArray:
-    """Of points (N, 3), those nearest to the centre of their voxel (M, 3), in the given order."""
-    lattice = Lattice((0.0, 0.0, 0.0), side)
-    voxels = lattice.voxels(points)
-    distance = ((points - lattice.centres(voxels)) ** 2).sum(axis=1)
-    nearest_first = np.argsort(distance, kind="stable")
-    _, first = np.unique(voxels[nearest_first], axis=0, return_index=True)
-    return points[np.sort(nearest_first[first])]
 
 
 def _surface_pixels(
@@ -240,16 +235,3 @@ def _workspace(rig: Rig, on_object: FloatArray, diameter: float | None) -> Works
             "[[x0, x1], [y0, y1], [z0, z1]]"
         )
     return Workspace.around(on_object, diameter)
-
-
-def _outside_of(on_object: FloatArray, free: FloatArray, spacing: float) -> FloatArray:
-    """Free centres (N, 3) but for those that a measured surface point can lie behind.
-
-    A ray that passes a voxel passes its centre at up to half the voxel's diagonal, so that nearer
-    to the surface than this a centre may be inside the object.
-    """
-    if len(on_object) == 0 or len(free) == 0:
-        return free
-    margin = sqrt(0.75) * spacing
-    nearest = cKDTree(on_object).query(free, distance_upper_bound=margin)[0]
-    return free[~(nearest <= margin)]

@@ -10,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from chsel.errors import SessionError
+from chsel.events import SensorImage
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.poses import apply, inverse, rotated, rotation_angle
 from chsel.sensing.contact_sensing import contact_mask, deformation, smooth
@@ -20,7 +21,6 @@ from chsel.sensing.depth_camera import (
     small_regions,
     valid_pixels,
 )
-from replay.events import SensorImage
 from runners.sensors.cell import RobotCell
 from runners.sensors.depth_camera import View, metres, recorded_image, view_of
 from runners.sensors.log.images import read_image

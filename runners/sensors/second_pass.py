@@ -7,11 +7,11 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
+from chsel.events import Logged, Probe, RigDescribed, SensorImage
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.sensing.contact_sensing import contact_subset, share
-from replay.events import Logged, Probe, RigDescribed, SensorImage
 from runners.sensors.cell import RobotCell
 from runners.sensors.clouds import Clouds
 from runners.sensors.depth_camera import DepthCamera

@@ -14,7 +14,7 @@ from runners.sessions.probing import open_probing
 from runners.sessions.probing_settings import ProbingSettings
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 from runners.sessions.sensors import SensorsSettings, open_sensors
-from runners.sessions.session import Session
+from runners.sessions.source import ProbeSource
 
 SESSIONS: dict[str, type[Any]] = {
     "simulated": ProbingSettings,
@@ -31,7 +31,7 @@ def session_settings(kind: str, config: Mapping[str, Any]) -> Any:
     return build_settings(SESSIONS[kind], config, "session")
 
 
-def open_session(kind: str, settings: Any, object_model: ObjectModel, seed: int) -> Session:
+def open_session(kind: str, settings: Any, object_model: ObjectModel, seed: int) -> ProbeSource:
     """Open a session with settings from `session_settings`.
 
     Raises ChselError if it cannot be opened, or if a configuration is one of another object.

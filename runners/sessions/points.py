@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import ChselError, PointsError, PoseError, SettingError, require_positive
+from chsel.events import Probe
 from chsel.numerics.arrays import FloatArray, IntArray, frozen, read_npz
 from chsel.problem.points import (
     FREE_RESOLUTION,
@@ -22,7 +23,6 @@ from chsel.problem.points import (
 from chsel.problem.poses import nearest_rigid
 from chsel.problem.sdf_grid import OBJECT_PADDING
 from chsel.problem.streams import LAST_STEP
-from replay.events import Probe
 from runners.objects.loader import ObjectModel
 
 
@@ -50,7 +50,7 @@ class PointsSettings:
 
 
 class PointsSession:
-    """Replays the steps of a file; a probe's index is the file's step; see `Session`.
+    """Replays the steps of a file; a probe's index is the file's step; see `ProbeSource`.
 
     Raises PointsError for points that cannot be those of the object.
     """

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from chsel.errors import SettingError
+from chsel.events import Probe
 from chsel.next_probe.action_lattice import (
     ActionSettings,
     around_actions,
@@ -19,7 +20,6 @@ from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
-from replay.events import Probe
 from runners.sessions.configurations import WORKSPACE, Configuration, find_configuration
 from runners.sessions.faults import Faults, FaultSettings, probed_mesh
 from runners.sessions.gripper import X_REST, Engine, Gripper
@@ -32,7 +32,7 @@ from runners.sessions.probing_hand import (
     world_from_gripper,
 )
 from runners.sessions.probing_settings import ProbingSettings
-from runners.sessions.session import require_available
+from runners.sessions.source import require_available
 
 if TYPE_CHECKING:
     import trimesh
@@ -63,7 +63,7 @@ def open_probing(
 
 
 class ProbingSession:
-    """Probes one configuration with a gripper in either engine; see `Session`."""
+    """Probes one configuration with a gripper in either engine; see `ProbeSource`."""
 
     def __init__(
         self,

@@ -13,20 +13,20 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from chsel.errors import RecordingError, SettingError
+from chsel.events import Event, Probe, RigDescribed, SessionStarted
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
-from replay.events import Event, Probe, RigDescribed, SessionStarted
 from replay.files import file_digest
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.schemas import PROFILE
 from runners.objects.loader import ObjectConfig, load_object
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
 from runners.sessions import open_session, session_settings
-from runners.sessions.session import Session
+from runners.sessions.source import ProbeSource
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class ProbedProblems:
     """All points up to a step; where a registration starts does not matter here."""
 
     def __init__(
-        self, events: Sequence[Event], of: Session | SessionStarted, sdf: SdfGrid, seed: int
+        self, events: Sequence[Event], of: ProbeSource | SessionStarted, sdf: SdfGrid, seed: int
     ) -> None:
         self._probes = [event for event in events if isinstance(event, Probe)]
         self._of, self._sdf, self._seed = of, sdf, seed

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import PointsError, PoseError, SessionError, SettingError
+from chsel.events import Probe
 from chsel.next_probe.action_lattice import ActionSettings, straight_actions
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
@@ -19,11 +20,10 @@ from chsel.problem.poses import apply, nearest_rigid
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
 from chsel.sensing.free_space import interior_lattice, poses_between
-from replay.events import Probe
 from replay.mcap.reader import read_recording
 from runners.sessions.probing_hand import DescribedHand, open_hand
 from runners.sessions.probing_settings import ProbingSettings
-from runners.sessions.session import require_available
+from runners.sessions.source import require_available
 
 _OF_GRIPPERS = ("simulated", "kinematic")  # sessions with a hand of ours
 

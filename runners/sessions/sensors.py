@@ -10,10 +10,10 @@ from typing import Annotated
 import numpy as np
 
 from chsel.errors import SettingError
+from chsel.events import Logged, Probe, RigDescribed
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, check_points
 from chsel.problem.settings import CheckedSettings, not_negative, positive
-from replay.events import Logged, Probe, RigDescribed
 from replay.files import file_digest
 from runners.objects.loader import ObjectModel
 from runners.sensors.cell import FreeMap, RobotCell
@@ -30,7 +30,7 @@ from runners.sensors.rig import Rig
 from runners.sensors.second_pass import SecondPass
 from runners.sensors.session_report import LogWarnings, Report
 from runners.sessions.probing import box_shell
-from runners.sessions.session import Session, SessionEvent
+from runners.sessions.source import ProbeEvent, ProbeSource
 
 NO_POSE = "none"
 _MANY_EDGES = 0.4  # of a camera's pixels: rather a slanted surface, seen in few pixels
@@ -61,7 +61,7 @@ class SensorsSettings(CheckedSettings):
             )
 
 
-def open_sensors(settings: SensorsSettings, object_model: ObjectModel, seed: int) -> Session:
+def open_sensors(settings: SensorsSettings, object_model: ObjectModel, seed: int) -> ProbeSource:
     """The session of a log, or of a depth image. Raises SessionError if it cannot be used."""
     path = Path(settings.path or "").expanduser()
     if path.suffix.lower() in FRAME_SUFFIXES:
@@ -73,7 +73,7 @@ def open_sensors(settings: SensorsSettings, object_model: ObjectModel, seed: int
 
 
 class SensorsSession:
-    """Reads a log twice: what is small at once, images one after the other; see `Session`."""
+    """Reads a log twice: what is small at once, images one after the other; see `ProbeSource`."""
 
     def __init__(
         self, settings: SensorsSettings, seed: int, *, diameter: float | None = None
@@ -110,7 +110,7 @@ class SensorsSession:
         for step in sorted(annotated - {window.step for window in self._first_pass.windows}):
             self._opening.warn(f"the rig annotates probe {step}, which the log does not have")
 
-    def probes(self) -> Iterator[SessionEvent]:
+    def probes(self) -> Iterator[ProbeEvent]:
         """The probes of the log, in their order, once; its images are read as they go."""
         rig, first_pass, warnings = self._rig, self._first_pass, LogWarnings(self._opening)
         tree, gap, gate = first_pass.tree, rig.clock.gap, rig.gate
@@ -154,7 +154,7 @@ class SensorsSession:
 
 
 class DepthFrameSession:
-    """The known points of a depth image as a single probe; see `Session`."""
+    """The known points of a depth image as a single probe; see `ProbeSource`."""
 
     def __init__(
         self,
@@ -179,7 +179,7 @@ class DepthFrameSession:
         self.world_from_object = self._frame.world_from_object
         check_points(self._points.points, diameter, free_resolution, self.workspace)
 
-    def probes(self) -> Iterator[SessionEvent]:
+    def probes(self) -> Iterator[ProbeEvent]:
         """The image, and what follows from it."""
         found, (camera,) = self._points, self._rig.cameras
         self.report.by_probe[0] = {camera.name: found.counts}

@@ -11,10 +11,10 @@ import pyarrow.parquet as parquet
 import pytest
 
 from chsel import CompiledCost
+from chsel.events import Decided
 from chsel.next_probe.forecast import Forecast
 from chsel.policies import build_policy
 from replay.__main__ import program as replay
-from replay.events import Decided
 from replay.mcap.reader import read_recording
 from tests.chsel.samples import REPOSITORY
 from tests.runners.in_process import run

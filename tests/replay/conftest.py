@@ -10,14 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
-from chsel.numerics.arrays import digest
-from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.poses import compose, random_rotations
-from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.streams import StreamKey
-from replay.events import (
+from chsel.events import (
     ActionsOffered,
     Decided,
     Event,
@@ -34,6 +27,13 @@ from replay.events import (
     Timed,
     Traced,
 )
+from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
+from chsel.numerics.arrays import digest
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import compose, random_rotations
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
 from replay.mcap.writer import McapRecorder
 from tests.tools.small_recordings import steered_session
 

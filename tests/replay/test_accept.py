@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from chsel.events import ListRecorder, Measured, ProblemPosed, RigDescribed, SensorImage
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem import online_registration as online
 from chsel.problem.points import KnownPoints, Workspace
@@ -17,11 +18,9 @@ from chsel.problem.poses import axis_angle, compose, inverse
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
+from chsel.registration import register_recorded
 from replay.__main__ import main
-from replay.events import Measured, ProblemPosed, RigDescribed, SensorImage
 from replay.mcap.reader import read_recording
-from replay.recorder import ListRecorder
-from replay.registration import register_recorded
 from replay.verbs.accept import best_pose_moves, write_accepted
 from tests.replay.conftest import same_bits
 from tests.tools.small_recordings import robot_session

@@ -14,6 +14,7 @@ from rerun.chunk import RrdReader
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.errors import EngineError, RecordingError, SettingError
+from chsel.events import SessionStarted
 from chsel.methods import build_method
 from chsel.plausible.plausible_set import plausible_set, save_plausible
 from chsel.plausible.plausible_settings import plausible_settings
@@ -23,7 +24,6 @@ from chsel.problem.streams import StreamKey
 from replay.__main__ import main
 from replay.comparing.choices import METHOD, chosen, is_recorded, recorded_method
 from replay.comparing.comparison import common_cost, compared, recorded_label
-from replay.events import SessionStarted
 from replay.mcap.reader import read_recording
 from tests.tools.small_recordings import METHODS, registered_session, write_recording
 

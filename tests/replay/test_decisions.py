@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 
+from chsel.events import Decided, ProblemPosed, SessionStarted
 from chsel.next_probe.decision_problem import Actions
 from chsel.policies import build_policy
 from chsel.problem.poses import axis_angle, compose
@@ -15,7 +16,6 @@ from replay.__main__ import main
 from replay.comparing.choices import POLICY, chosen
 from replay.comparing.differences import result_differences
 from replay.comparing.verification import DIFFERS, EQUAL, verify
-from replay.events import Decided, ProblemPosed, SessionStarted
 from replay.mcap.reader import read_recording
 from replay.verbs.compare import policy_decisions
 from replay.verbs.info import recording_info

@@ -7,9 +7,7 @@ import re
 import numpy as np
 import trimesh
 
-from chsel.problem.sdf_grid import SdfGrid
-from replay.__main__ import main
-from replay.events import (
+from chsel.events import (
     HypothesesFound,
     Measured,
     Probe,
@@ -18,6 +16,8 @@ from replay.events import (
     SessionStarted,
     Traced,
 )
+from chsel.problem.sdf_grid import SdfGrid
+from replay.__main__ import main
 from replay.verbs.diff import FIRST, SECOND, recording_diff
 from tests.replay.conftest import changed, nth
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from chsel.errors import SettingError
+from chsel.events import HypothesesFound, SensorImage, SnapshotTaken
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse
 from replay.__main__ import main
-from replay.events import HypothesesFound, SensorImage, SnapshotTaken
 from replay.mcap.reader import read_recording
 from replay.verbs.export import EXPORTS, exported_archive
 from runners.sessions.points import PointsSession, PointsSettings

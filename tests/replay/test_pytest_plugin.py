@@ -8,9 +8,9 @@ from pathlib import Path
 import numba
 import pytest
 
+from chsel.events import Decided
 from chsel.methods import METHODS, preset_settings
 from chsel.problem.settings import settings_mapping
-from replay.events import Decided
 from replay.mcap.reader import read_recording
 from runners.objects.loader import MODELS
 from tests.replay.conftest import changed, nth

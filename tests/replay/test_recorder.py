@@ -19,9 +19,9 @@ import pytest
 from rerun.chunk import RrdReader
 
 from chsel.errors import RecordingError
+from chsel.events import Measured
 from chsel.problem import online_registration as online
 from replay.__main__ import main
-from replay.events import Measured
 from replay.files import WritingError, new_file, whole_file
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
@@ -128,7 +128,7 @@ def test_an_error_of_pictures_is_raised_or_a_warning_and_files_are_closed(option
 
 _SCRIPT = """
 import os, runpy, signal, sys
-from replay.events import Recorder
+from chsel.events import Recorder
 from replay.recorder import Recorders
 from replay.mcap.writer import McapRecorder
 events = runpy.run_path(sys.argv[1])["example_events"]()

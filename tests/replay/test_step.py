@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from chsel.errors import RecordingError
+from chsel.events import HypothesesFound, SessionEnded
 from replay.__main__ import main
 from replay.comparing.choices import METHOD, chosen
 from replay.comparing.verification import EQUAL, verify
 from replay.environment import environment
-from replay.events import HypothesesFound, SessionEnded
 from replay.files import file_digest
 from replay.mcap.reader import read_recording
 from tests.tools.small_recordings import registered_session, write_recording

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from chsel.events import HypothesesFound, Measured, SessionStarted, Traced
 from replay.__main__ import main
 from replay.comparing.differences import is_close
 from replay.comparing.verification import DIFFERS, EQUAL, NO_RESULT, verified_files, verify
-from replay.events import HypothesesFound, Measured, SessionStarted, Traced
 from replay.mcap.reader import read_recording
 from tests.replay.conftest import changed, nth
 from tests.tools.small_recordings import registered_session

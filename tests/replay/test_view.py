@@ -15,8 +15,8 @@ import pytest
 from mcap.reader import make_reader
 from rerun.blueprint.components import PlayState
 
+from chsel.events import HypothesesFound, Probe, ProblemPosed, Timed
 from replay.__main__ import main
-from replay.events import HypothesesFound, Probe, ProblemPosed, Timed
 from replay.rerun import viewer as rerun_viewer
 from replay.rerun.rerun_recorder import RerunRecorder
 from replay.verbs.info import is_other_programs, log_info, recording_info

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import pytest
 from hydra._internal.hydra import Hydra
 
+from chsel.registration import one_line
 from runners.evaluation import tasks
-from runners.run.session_run import one_line
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from chsel.events import Logged
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.sdf_grid import mesh_sdf
-from replay.events import Logged
 from replay.mcap.reader import read_recording
 from runners.probe import main
 from tests.runners.in_process import Done, run

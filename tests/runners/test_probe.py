@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 
 import chsel
 from chsel.errors import MeshError
+from chsel.events import Logged, Measured
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import object_symmetry
-from replay.events import Logged, Measured
 from replay.mcap.reader import read_recording
 from runners import probe
 from runners.command.choices import CONF

@@ -8,6 +8,7 @@ import trimesh
 
 import chsel
 from chsel.errors import RecordingError
+from chsel.events import Event, ListRecorder, Measured, Recorder, SnapshotTaken, Traced
 from chsel.methods import build_method
 from chsel.numerics.arrays import digest
 from chsel.problem.points import KnownPoints, Workspace
@@ -15,10 +16,8 @@ from chsel.problem.poses import apply, axis_angle, compose
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from replay.events import Event, Measured, Recorder, SnapshotTaken, Traced
+from chsel.registration import StepObserver
 from replay.mcap.reader import read_recording
-from replay.recorder import ListRecorder
-from replay.registration import StepObserver
 from runners.objects.loader import load_model
 from runners.probe import main
 from runners.run.recording import make_run_folder

@@ -8,10 +8,10 @@ import pytest
 import yaml
 
 from chsel.errors import SettingError
+from chsel.events import RigDescribed
 from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.poses import compose, inverse, roll_pitch_yaw, rotation_angle, rotation_vector
-from replay.events import RigDescribed
 from replay.mcap.reader import read_recording
 from runners import evaluate
 from runners.command.choices import CONF

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from chsel.events import Decided, Probe
 from chsel.policies.steering import Steering
-from replay.events import Decided, Probe
 from replay.mcap.reader import Recording, read_recording
 from runners import probe
 from tests.runners.in_process import Done, run

@@ -20,8 +20,8 @@ import torch
 import trimesh
 
 from chsel.errors import RecordingError
+from chsel.events import Probe, ProblemPosed, SessionEnded
 from chsel.problem.poses import apply, axis_angle, compose
-from replay.events import Probe, ProblemPosed, SessionEnded
 from replay.mcap.reader import read_recording
 from replay.mcap.recovery import recover, tells_loss
 from runners import probe

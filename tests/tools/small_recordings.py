@@ -5,17 +5,10 @@ import dataclasses
 import numpy as np
 import trimesh
 
-from chsel.methods import build_method
-from chsel.next_probe.decision_problem import Actions, HandShape
-from chsel.policies import build_policy
-from chsel.policies.steering import Steering
-from chsel.problem.online_registration import OnlineRegistration
-from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.settings import settings_mapping
-from replay.events import (
+from chsel.events import (
     ActionsOffered,
     Decided,
+    ListRecorder,
     Logged,
     Probe,
     ProblemPosed,
@@ -24,9 +17,16 @@ from replay.events import (
     SessionEnded,
     SessionStarted,
 )
+from chsel.methods import build_method
+from chsel.next_probe.decision_problem import Actions, HandShape
+from chsel.policies import build_policy
+from chsel.policies.steering import Steering
+from chsel.problem.online_registration import OnlineRegistration
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import settings_mapping
+from chsel.registration import register_recorded, symmetry_for_errors
 from replay.mcap.writer import McapRecorder
-from replay.recorder import ListRecorder
-from replay.registration import register_recorded, symmetry_for_errors
 
 _SIDES = (0.1, 0.06, 0.04)
 STEERED = {"probes": 3, "stop": {"spread": 0.0, "gain": 0.0}, "belief": {"poses": 8}}

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from chsel.errors import RecordingError
-from replay.events import ProblemPosed
+from chsel.events import ProblemPosed
 from replay.mcap.encoding import decode, encode, message_class
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import FORMAT_VERSION, RECORDS

@@ -16,8 +16,8 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 
 import replay
+from chsel.events import Decided, HypothesesFound, Probe
 from chsel.problem.poses import inverse, rotation_matrices
-from replay.events import Decided, HypothesesFound, Probe
 from replay.mcap.foxglove_messages import FOXGLOVE, POINT_CLASSES, VIEWS
 from replay.mcap.schemas import MESSAGES, RECORDS, STEP_TIME
 from replay.mcap.viewer_messages import CumulativePoints, next_probe, simple_mesh

@@ -11,8 +11,8 @@ import pytest
 from mcap.reader import make_reader
 
 from chsel.errors import RecordingError
+from chsel.events import HypothesesFound, ProblemPosed
 from chsel.problem.points import KnownPoints
-from replay.events import HypothesesFound, ProblemPosed
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
 from tests.replay.conftest import changed, example_events, nth

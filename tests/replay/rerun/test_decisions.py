@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from chsel.events import ActionsOffered, Decided, Probe, SessionEnded
 from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import compose
 from chsel.problem.streams import StreamKey
-from replay.events import ActionsOffered, Decided, Probe, SessionEnded
 from tests.replay.rerun.test_recorder import ALONG_X, SDF, WORKSPACE, started, write
 from tests.tools.rrd_rows import read, shown_at
 

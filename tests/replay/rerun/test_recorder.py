@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.poses import compose, inverse, random_rotations
-from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.streams import StreamKey
-from replay.colors import CostScale
-from replay.events import (
+from chsel.events import (
     HypothesesFound,
     Measured,
     Probe,
@@ -27,6 +21,12 @@ from replay.events import (
     Timed,
     Traced,
 )
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import compose, inverse, random_rotations
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
+from replay.colors import CostScale
 from replay.rerun import viewer as rerun_viewer
 from replay.rerun.rerun_recorder import RerunRecorder
 from replay.rerun.scene import LEVELS, cost_levels

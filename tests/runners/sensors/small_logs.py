@@ -11,9 +11,9 @@ from mcap.writer import CompressionType
 from mcap_ros2.writer import Writer
 from PIL import Image
 
+from chsel.events import Logged, Probe
 from chsel.problem.poses import compose
 from chsel.sensing.depth_camera import PinholeCamera
-from replay.events import Logged, Probe
 from runners.sensors.log.ros2_definitions import DEFINITIONS, full_definition
 from runners.sessions.sensors import SensorsSession, SensorsSettings
 from runners.simulated_robot.log_writer import camera_info, header, image, joint_state, transform

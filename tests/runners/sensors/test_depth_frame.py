@@ -12,10 +12,10 @@ from chsel.problem.mesh import load_mesh
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
+from chsel.sensing.depth_camera import one_per_voxel
 from runners.command.choices import CONF
 from runners.sensors.depth_frame import (
     depth_frame_points,
-    one_per_voxel,
     read_depth_frame,
 )
 from runners.sensors.rig import GateRig, Rig

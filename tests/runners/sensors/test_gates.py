@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from replay.events import Logged
+from chsel.events import Logged
 from replay.mcap.reader import read_recording
 from runners.probe import main
 from runners.sensors.rig import CloudRig, GateRig, Rig

@@ -9,11 +9,11 @@ import pytest
 import trimesh
 
 from chsel.errors import SettingError
+from chsel.events import Probe
 from chsel.problem.points import Lattice
 from chsel.problem.poses import apply, axis_angle, compose, inverse, rotation_angle
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import in_preset
-from replay.events import Probe
 from runners.objects.loader import MODELS, load_model
 from runners.sessions.configurations import CONFIGURATIONS, find_configuration
 from runners.sessions.gripper import X_REST

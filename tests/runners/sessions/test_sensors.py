@@ -8,8 +8,8 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
 from chsel.errors import SessionError, SettingError
+from chsel.events import Logged, Probe, RigDescribed, SensorImage
 from chsel.problem.poses import apply
-from replay.events import Logged, Probe, RigDescribed, SensorImage
 from runners.sensors.pose_file import beside, write_pose
 from runners.sensors.rig import Annotations, CloudRig, ExtraContacts, HandRig, ProbeTimes
 from runners.sessions.sensors import SensorsSession, SensorsSettings

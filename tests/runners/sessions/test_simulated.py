@@ -9,10 +9,10 @@ import pytest
 import trimesh
 
 from chsel.errors import SessionError
+from chsel.events import Probe
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
-from replay.events import Probe
 from runners.objects.loader import load_model
 from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.placement import laid_down, lowest

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
+from chsel.events import Probe
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
-from replay.events import Probe
 from runners.command.choices import CONF
 from runners.objects.loader import load_model
 from runners.sensors.log.messages import CameraInfoMessage, ImageMessage, Received

@@ -1,4 +1,4 @@
-"""What happens in a session: the values that recorders write and readers give back.
+"""What happens in a session: the values that a session announces to recorders.
 
 `replay.mcap.schemas` says how the message on an event's topic is stored, and what it accepts.
 """
@@ -245,3 +245,14 @@ class Recorder:
 
     def close(self) -> None:
         """Finish what was written. Closing twice is closing once."""
+
+
+class ListRecorder(Recorder):
+    """Keeps the events in `events`."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+
+    def record(self, event: Event) -> None:
+        """Keep it."""
+        self.events.append(event)

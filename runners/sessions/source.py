@@ -6,17 +6,17 @@ from collections.abc import Iterator
 from typing import Protocol, runtime_checkable
 
 from chsel.errors import SessionError
+from chsel.events import Logged, Probe, RigDescribed, SensorImage
 from chsel.next_probe.action_lattice import ActionSettings
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import KnownPoints, Workspace
-from replay.events import Logged, Probe, RigDescribed, SensorImage
 
-SessionEvent = RigDescribed | SensorImage | Logged | Probe
+ProbeEvent = RigDescribed | SensorImage | Logged | Probe
 """What a session yields: probes, and ahead of each what else is to be recorded about it."""
 
 
-class Session(Protocol):
+class ProbeSource(Protocol):
     """A source of known points, probe by probe. The object does not move in a session."""
 
     workspace: Workspace
@@ -34,7 +34,7 @@ class Session(Protocol):
     count: int
     """How many probes there will be."""
 
-    def probes(self) -> Iterator[SessionEvent]:
+    def probes(self) -> Iterator[ProbeEvent]:
         """Do, or read, one probe after the other; events that are no Probe are to be recorded."""
 
     def close(self) -> None:
@@ -42,7 +42,7 @@ class Session(Protocol):
 
 
 @runtime_checkable
-class Steerable(Session, Protocol):
+class Steerable(ProbeSource, Protocol):
     """A session whose probes can be chosen, one after the other, in place of `probes`."""
 
     hand: HandShape
@@ -54,7 +54,7 @@ class Steerable(Session, Protocol):
     def available(self) -> BoolArray:
         """Which of them (A,) can be taken now."""
 
-    def take(self, step: int, action: int) -> Iterator[SessionEvent]:
+    def take(self, step: int, action: int) -> Iterator[ProbeEvent]:
         """Do the probe `step` as an action (its index) says; the last event is its Probe.
 
         Raises SessionError for an action that cannot be taken.

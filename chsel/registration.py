@@ -1,21 +1,15 @@
-"""Runs registrations and records them: new ones, and recorded problems again."""
+"""Runs registrations, and announces them to recorders."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from chsel.methods import trust_by
-from chsel.methods.method import Method
-from chsel.numerics.arrays import FloatArray, digest
-from chsel.plausible.pose_metrics import result_numbers
-from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
-from chsel.problem.online_registration import OnlineRegistration
-from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
-from replay.events import (
+from chsel.errors import ChselError
+from chsel.events import (
     HypothesesFound,
     Measured,
     ProblemPosed,
@@ -24,7 +18,26 @@ from replay.events import (
     SnapshotTaken,
     Traced,
 )
-from replay.mcap.reader import Recording
+from chsel.methods import trust_by
+from chsel.methods.method import Method
+from chsel.numerics.arrays import FloatArray, digest
+from chsel.plausible.pose_metrics import result_numbers
+from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
+
+
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """What a registration gave: its result with trust, numbers, wall-clock seconds by stage."""
+
+    hypotheses: Hypotheses
+    numbers: Mapping[str, float]
+    seconds: Mapping[str, float]
+
+    @property
+    def total_seconds(self) -> float:
+        """Of all stages."""
+        return sum(self.seconds.values())
 
 
 class StepObserver:
@@ -64,44 +77,6 @@ class StepObserver:
         self._recorder.record(SnapshotTaken(self._step, archive))
 
 
-@dataclass(frozen=True, eq=False)
-class Registered:
-    """What a registration gave: its result with trust, numbers, wall-clock seconds by stage."""
-
-    hypotheses: Hypotheses
-    numbers: Mapping[str, float]
-    seconds: Mapping[str, float]
-
-    @property
-    def total_seconds(self) -> float:
-        """Of all stages."""
-        return sum(self.seconds.values())
-
-
-def recorded_online(recording: Recording, method: Method) -> OnlineRegistration:
-    """The loop that a recorded session walks with a method, before its first step."""
-    start = recording.start
-    return OnlineRegistration(
-        start.sdf,
-        start.workspace,
-        start.free_resolution,
-        method.online,
-        seed=recording.seed,
-        points=start.initial_points,
-    )
-
-
-def symmetry_for_errors(start: SessionStarted) -> ObjectSymmetry | None:
-    """The symmetries of a session's object; None if no true pose is known to need them."""
-    return None if start.world_from_object is None else object_symmetry(start.mesh)
-
-
-def snapshot_interval(snapshots: Sequence[ArchiveSnapshot]) -> int:
-    """Iterations between recorded snapshots; 0 if there are the first and the last alone."""
-    iterations = sorted({archive.iteration for archive in snapshots})
-    return iterations[1] if len(iterations) > 2 else 0
-
-
 def register_recorded(
     posed: ProblemPosed,
     method: Method,
@@ -129,3 +104,14 @@ def register_recorded(
     numbers = result_numbers(hypotheses, posed.problem, truth, symmetry, trust)
     recorder.record(Measured(posed.step, numbers))
     return Registered(replace(hypotheses, trust=trust), numbers, seconds)
+
+
+def symmetry_for_errors(start: SessionStarted) -> ObjectSymmetry | None:
+    """The symmetries of a session's object; None if no true pose is known to need them."""
+    return None if start.world_from_object is None else object_symmetry(start.mesh)
+
+
+def one_line(error: BaseException) -> str:
+    """The text of an error, with its class if it is none of ours."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, ChselError) else f"{type(error).__name__}: {text}"
