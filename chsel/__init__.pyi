@@ -37,5 +37,7 @@ from .sensing.free_space import interior_lattice as interior_lattice
 from .sensing.free_space import poses_between as poses_between
 from .session import NextProbe as NextProbe
 from .session import Session as Session
+from .which_object import Candidate as Candidate
+from .which_object import WhichObject as WhichObject
 
 __version__: str

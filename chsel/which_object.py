@@ -1,0 +1,116 @@
+"""Which of several objects it is: all are registered, and compared by how well they fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from chsel.errors import SettingError, quoted
+from chsel.next_probe.decision_problem import Actions
+from chsel.problem.noise import LIMIT, noise_model
+from chsel.problem.poses import Poses
+from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.trust import SENSOR_NOISE, pose_energies
+from chsel.session import NextProbe, Session
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """How well one of the objects fits."""
+
+    name: str
+    energy: float  # nats, of its best hypothesis: the lowest is the likeliest object
+    alive: bool  # whether the points do not speak against it
+    answer: Hypotheses
+
+
+class WhichObject:
+    """Sessions of several objects that share what is added.
+
+    sessions: by name. candidates: at the last registration, the likeliest first.
+    """
+
+    def __init__(
+        self,
+        targets: Mapping[str, trimesh.Trimesh] | Sequence[str | Path],
+        *,
+        record: str | Path | None = None,
+        noise: float = SENSOR_NOISE,
+        **given: Any,
+    ) -> None:
+        """Open a session for each object.
+
+        targets: meshes by name, or paths, whose stems are the names. record: a new file NAME.mcap;
+        each object has its own, NAME_OBJECT.mcap. noise: of contacts, metres, one for all
+        objects, so that their energies can be compared. given: the same of
+        all, see `chsel.Session`. Raises SettingError for fewer than two, or two of one name.
+        """
+        named = targets if isinstance(targets, Mapping) else {Path(t).stem: t for t in targets}
+        if len(named) < max(len(targets), 2):
+            shown = quoted(list(targets))
+            raise SettingError(f"targets are {shown}; accepted: two or more, of different names")
+        self.sessions: dict[str, Session] = {}
+        self.candidates: list[Candidate] = []
+        self._noise = noise
+        path = None if record is None else Path(record)
+        for name, target in named.items():
+            own = None if path is None else path.with_name(f"{path.stem}_{name}{path.suffix}")
+            self.sessions[name] = Session(target, record=own, **given)
+
+    def add(self, **what: Any) -> None:
+        """Add what became known to all, see `Session.add`."""
+        for session in self.sessions.values():
+            session.add(**what)
+
+    def register(self) -> list[Candidate]:
+        """Register every object; the likeliest first.
+
+        Energies are those of `chsel.problem.noise`, at one noise for all.
+        """
+        found = []
+        for name, session in self.sessions.items():
+            answer = session.register()
+            assert session.problem is not None
+            poses = Poses.of(answer.object_from_world[np.isfinite(answer.cost)])
+            energies = pose_energies(session.problem, poses, noise_model(self._noise))
+            found.append((float(energies.min(initial=np.inf)), name, answer))
+        least = min(energy for energy, *_ in found)
+        found.sort(key=lambda one: one[0])
+        self.candidates = [
+            Candidate(name, energy, energy <= least + LIMIT, answer)
+            for energy, name, answer in found
+        ]
+        return self.candidates
+
+    def next_probe(self, actions: Actions | None = None) -> NextProbe | None:
+        """Where to touch next, by the likeliest object, see `Session.next_probe`."""
+        if not self.candidates:
+            raise SettingError("nothing is registered; accepted: `register` before `next_probe`")
+        return self.sessions[self.candidates[0].name].next_probe(actions)
+
+    def close(self, outcome: str = "finished") -> None:
+        """End all recordings."""
+        with ExitStack() as stack:
+            for session in self.sessions.values():
+                stack.callback(session.close, outcome)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for session in self.sessions.values():
+            session.__exit__(kind, error, trace)

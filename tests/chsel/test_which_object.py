@@ -1,0 +1,32 @@
+"""Which of several objects it is, told by contacts on one of them."""
+
+import numpy as np
+import pytest
+import trimesh
+
+import chsel
+from chsel.problem.poses import apply
+from replay.comparing.verification import EQUAL, verify
+from replay.mcap.reader import read_recording
+from tests.chsel.methods.scene import BOX, BOX_SIDES, TRUTH, on_faces
+
+
+def test_the_true_object_comes_first(tmp_path):
+    slim = trimesh.creation.box(BOX_SIDES * [1.0, 0.5, 1.0])
+    contacts = apply(TRUTH, on_faces(12))
+    around = contacts.mean(axis=0) + np.random.default_rng(0).uniform(-0.3, 0.3, (400, 3))
+    in_box = apply(np.linalg.inv(TRUTH), around)
+    free = around[(np.abs(in_box) > 0.5 * BOX_SIDES + 0.02).any(axis=1)]
+    meshes = {"slim": slim, "box": BOX}
+    with chsel.WhichObject(meshes, record=tmp_path / "touches.mcap") as which:
+        which.add(contacts=contacts, free=free)
+        first, second = which.register()
+    assert (first.name, second.name) == ("box", "slim")
+    assert first.alive
+    assert not second.alive
+    # Four contacts are on the wide sides, which the slim box cannot reach, 30 mm off for two.
+    assert second.energy - first.energy > 9.0
+    verdicts = list(verify(read_recording(tmp_path / "touches_slim.mcap")))
+    assert [verdict.outcome for verdict in verdicts] == [EQUAL]
+    with pytest.raises(chsel.ChselError, match="accepted: two or more, of different names"):
+        chsel.WhichObject(["a.obj", "other/a.obj"])
