@@ -1,6 +1,8 @@
 # What the package offers: read by type checkers and editors, and by the package itself.
 
 from .api import register as register
+from .belief import Gripper as Gripper
+from .belief import PoseBelief as PoseBelief
 from .cost.compiled_cost import CompiledCost as CompiledCost
 from .cost.cost_settings import CostSettings as CostSettings
 from .cost.torch_cost import RelaxedCost as RelaxedCost

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from chsel.api import method_settings
+from chsel.belief import Gripper, PoseBelief
 from chsel.errors import InputWarning, PointsError, PoseError, SettingError, quoted
 from chsel.events import (
     ActionsOffered,
@@ -36,7 +37,7 @@ from chsel.methods.method import Method
 from chsel.next_probe.action_lattice import ActionSettings, around_actions
 from chsel.next_probe.decision_problem import Actions, Decision, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray, evenly_spaced, frozen
-from chsel.plausible.symmetry import ObjectSymmetry
+from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
 from chsel.policies import POLICIES, build_policy
 from chsel.policies.policy import Policy
 from chsel.policies.steering import Choice, Steering
@@ -92,6 +93,7 @@ class Session:
 
     step: of the last points that were added, -1 before. warnings: so far, each kind once. answer:
     the last result, None before. trust: in it. stop: why `next_probe` gave None, "" if it did not.
+    grasp: the world_from_gripper (4, 4) that works with the largest chance, None before.
     failure: why the last step has no result, "" if nothing failed. registered, problem: of the last
     step, None without a registration. seconds: by stage, of the last step. steering: of the next
     probe, None before there are actions. online: which problem follows, and all known points.
@@ -211,7 +213,10 @@ class Session:
         self.problem: RegistrationProblem | None = None
         self.answer: Hypotheses | None = None
         self.trust: Trust | None = None
+        self.grasp: FloatArray | None = None  # (4, 4), the best of the last ones
         self.seconds: dict[str, float] = {}
+        self._belief: PoseBelief | None = None  # of the result `_believed`
+        self._believed: Hypotheses | None = None
         self._decided = -2  # the step of the last decision
         self._taken: set[int] = set()  # actions, of those offered
 
@@ -393,11 +398,20 @@ class Session:
         assert self._hand is not None
         return around_actions(settings or ActionSettings(), self.started.workspace, self._hand)
 
-    def next_probe(self, actions: Actions | None = None) -> NextProbe | None:
+    def next_probe(
+        self,
+        actions: Actions | None = None,
+        *,
+        grasps: tuple[Any, Any] | None = None,
+        gripper: Gripper | None = None,
+        sure: float = 0.95,
+    ) -> NextProbe | None:
         """Where to touch next, by the policy; None if it stops, and `stop` says why.
 
         actions: that can be taken; by default those of `actions()`. Of the same actions, none is
         chosen twice. What is added next is taken as the outcome, unless it is a depth image.
+        grasps: object_from_gripper (G, 4, 4) and widths (G,) of a gripper. Where one of them works
+        with a chance of `sure`, `stop` is "grasp", and `grasp` is its world_from_gripper.
         """
         self._check_open()
         hand = self._require_hand()
@@ -405,6 +419,14 @@ class Session:
             return None
         if self._decided == self.step:
             raise SettingError("a probe was chosen before; accepted: `add` its outcome first")
+        if grasps is not None and self.answer is not None and self.trust is not None:
+            self.grasp, chance = self.belief.best_grasp(*grasps, gripper)
+            if chance >= sure:
+                text = f"stop: a grasp works with a chance of {chance:.2f}"
+                self._recorder.record(Logged(self.step, "info", text))
+                self.flush()
+                self.stop = "grasp"
+                return None
         if actions is None:
             actions = self.actions() if self.steering is None else self.steering.actions
         if not self._begun:
@@ -442,6 +464,20 @@ class Session:
     def flush(self) -> None:
         """Let all that was recorded survive the end of the process."""
         self._recorder.flush()
+
+    @property
+    def belief(self) -> PoseBelief:
+        """What the last result says about the object; modes keep their numbers.
+
+        Raises PoseError before there is a result with a pose.
+        """
+        if self.answer is None:
+            raise PoseError("nothing is registered yet; accepted: a belief after `register`")
+        if self._belief is None or self._believed is not self.answer:
+            symmetry = object_symmetry(self.started.mesh)
+            self._belief = PoseBelief(self.started.sdf, self.answer, symmetry, self._belief)
+            self._believed = self.answer
+        return self._belief
 
     def end_points(self) -> None:
         """Warn about points as they are at the end."""

@@ -1,0 +1,337 @@
+"""What a set of hypotheses says about an object: where it can be, and whether an action would work.
+
+All members count alike. So a chance is the share of the members for which something holds, with
+Wilson's interval for their number (Wilson, 1927).
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from chsel.errors import PoseError, SettingError, require_positive
+from chsel.next_probe.decision_problem import HandShape
+from chsel.numerics.arrays import FloatArray, IntArray, evenly_spaced, frozen
+from chsel.numerics.elementary import arctangents
+from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry
+from chsel.problem.poses import (
+    Poses,
+    apply,
+    axis_angle,
+    compose,
+    hat,
+    inverse,
+    nearest_rigid,
+    product,
+    rotated,
+    rotation_angle,
+    twice_sine_axis,
+)
+from chsel.problem.registration_problem import Hypotheses, Trust
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import CheckedSettings
+from chsel.problem.surface import outline_distances, outline_in_object, signed_distances
+from chsel.problem.trust import turned
+from chsel.sensing.free_space import interior_lattice
+
+if TYPE_CHECKING:
+    import trimesh
+
+_NORMAL = 1.6449  # standard deviations: 90 % of a normal distribution are within
+_SAME_MODE = 0.1  # of the diameter: as far as a mode moves from one result to the next
+_FINEST = 0.002  # m: nodes of a hand that collides
+_NODES_ACROSS = 5.0  # of a hand
+_TRIED = 6  # members at whose poses grasps of the object are tried
+
+
+class Chances(NamedTuple):
+    """Chances with their 90 % intervals."""
+
+    chance: FloatArray  # (G,)
+    lower: FloatArray  # (G,)
+    upper: FloatArray  # (G,)
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """A place of the object that explains the points."""
+
+    number: int  # the same from one result of a session to the next
+    weight: float  # share of the members
+    object_from_world: FloatArray  # (4, 4): the best member
+    # (6, 6), of the others about it: of the object's centre (metres) and of the rotation vector
+    # (radians), both in world axes, after the symmetry that brings each member nearest.
+    covariance: FloatArray
+    members: IntArray  # indices of poses
+
+
+@dataclass(frozen=True)
+class Gripper(CheckedSettings):
+    """Two parallel fingers; by default those of a Franka Panda hand. Metres.
+
+    Its frame has z towards the object and y from finger to finger; the origin is in the middle
+    between the fingers' tips.
+    """
+
+    width: float = 0.020  # of a finger, along x
+    thickness: float = 0.014  # of a finger, along y
+    length: float = 0.045  # of a finger, along z
+    pad: float = 0.018  # of its length: what holds the object
+    opening: float = 0.080  # the largest distance between the fingers
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, value in vars(self).items():
+            require_positive(name, value)
+
+
+class PoseBelief:
+    """The members of a result, and what they say.
+
+    object_from_world (K, 4, 4): the members, the best first. modes: places that explain the points,
+    the best first; empty where the result is wide, as a continuum has none, or where nothing fits.
+    trust: in the result.
+    """
+
+    def __init__(
+        self,
+        sdf: SdfGrid,
+        hypotheses: Hypotheses,
+        symmetry: ObjectSymmetry | None = None,
+        previous: PoseBelief | None = None,
+    ) -> None:
+        """symmetry: of the object, for covariances. previous: whose numbers modes keep.
+
+        Raises PoseError for a result without trust, as it has no pose.
+        """
+        if hypotheses.trust is None:
+            raise PoseError("the result has no trust; accepted: that of chsel.register")
+        kept = ~hypotheses.duplicate & np.isfinite(hypotheses.object_from_world).all(axis=(1, 2))
+        kept[list(hypotheses.trust.best_of_modes)] = True
+        self.object_from_world: FloatArray = hypotheses.object_from_world[kept]
+        self.trust: Trust = hypotheses.trust
+        self._sdf, self._poses = sdf, Poses.of(self.object_from_world)
+        self._symmetry = symmetry or grid_symmetry(sdf)
+        places = np.cumsum(kept) - 1
+        firsts = places[list(hypotheses.trust.best_of_modes)][: self.trust.modes]
+        self.numbers: int = 0 if previous is None else previous.numbers  # given to modes so far
+        self.modes: list[Mode] = self._modes(firsts, previous)
+
+    def _modes(self, firsts: IntArray, previous: PoseBelief | None) -> list[Mode]:
+        """Each member is of the mode whose best is nearest, and not turned against it."""
+        if len(firsts) == 0:
+            return []
+        apart = outline_distances(self._sdf, self._poses)
+        every = np.ones_like(apart, dtype=bool)
+        apart = apart + np.where(turned(self._sdf, self._poses, every), apart.max() + 1.0, 0.0)
+        mode = np.argmin(apart[firsts], axis=0)
+        numbers, found = self._numbers(firsts, previous), []
+        for n, first in enumerate(firsts):
+            members = np.flatnonzero(mode == n)
+            weight = len(members) / len(mode)
+            covariance = self._covariance(int(first), members)
+            best = self.object_from_world[first]
+            found.append(Mode(numbers[n], weight, best, covariance, members))
+        return found
+
+    def _numbers(self, firsts: IntArray, previous: PoseBelief | None) -> list[int]:
+        """Numbers of modes: those of the nearest before, or new ones."""
+        before = [] if previous is None else previous.modes
+        given: dict[int, int] = {}
+        if before:
+            old = Poses.of(np.stack([mode.object_from_world for mode in before]))
+            both = Poses.joined([self._poses[firsts], old])
+            apart = outline_distances(self._sdf, both)
+            away = apart + np.where(turned(self._sdf, both, apart < np.inf), np.inf, 0.0)
+            away = away[: len(firsts), len(firsts) :]
+            for at in np.argsort(away, axis=None, kind="stable"):
+                n, k = divmod(int(at), len(before))
+                near = away[n, k] <= _SAME_MODE * self._sdf.diameter
+                if near and n not in given and before[k].number not in given.values():
+                    given[n] = before[k].number
+        for n in range(len(firsts)):
+            if n not in given:
+                given[n], self.numbers = self.numbers, self.numbers + 1
+        return [given[n] for n in range(len(firsts))]
+
+    def _covariance(self, first: int, members: IntArray) -> FloatArray:
+        """Mean products (6, 6) of how members differ from the best of their mode."""
+        world_from_object = inverse(self.object_from_world[[first, *members]])
+        centres = apply(world_from_object[1:], self._symmetry.centre[None])[:, 0]
+        centre = apply(world_from_object[:1], self._symmetry.centre[None])[0, 0]
+        own, others = world_from_object[0, :3, :3], world_from_object[1:, :3, :3]
+        turns = product(_nearest_alike(self._symmetry, own, others), own.T)  # in world axes
+        vectors = np.concatenate([centres - centre, _rotation_vectors(turns)], axis=1)
+        return np.asarray((vectors[:, :, None] * vectors[:, None]).mean(axis=0))
+
+    @property
+    def spread(self) -> float:
+        """Root mean square distance of two members' surfaces, metres."""
+        return self.trust.spread
+
+    def __len__(self) -> int:
+        return len(self.object_from_world)
+
+    def __repr__(self) -> str:
+        lines = [f"<PoseBelief: {len(self)} poses, {self.trust}"]
+        for mode in self.modes[:3]:
+            size = 1000.0 * float(np.sqrt(np.trace(mode.covariance[:3, :3])))
+            x, y, z = inverse(mode.object_from_world)[:3, 3]
+            place = f"at [{x:.3f}, {y:.3f}, {z:.3f}] m, centre within {size:.1f} mm"
+            lines.append(f"mode {mode.number}: {100.0 * mode.weight:.0f} %, {place}")
+        if len(self.modes) > 3:
+            lines.append(f"and {len(self.modes) - 3} more")
+        return "\n  ".join(lines) + ">"
+
+    def sample(self, count: int, seed: int = 0) -> FloatArray:
+        """Poses object_from_world (count, 4, 4) of members, drawn alike."""
+        chosen = np.random.default_rng(seed).integers(len(self), size=count)
+        return self.object_from_world[chosen]
+
+    def occupancy(self, points: Any) -> FloatArray:
+        """The chance (N,) that each of points (N, 3), world, metres, is inside of the object."""
+        return (self._distances(points) < 0.0).mean(axis=0)
+
+    def contact_chance(self, points: Any, within: float = 0.002) -> FloatArray:
+        """The chance (N,) that the surface is within so many metres of points (N, 3), world."""
+        require_positive("within", within)
+        return (np.abs(self._distances(points)) <= within).mean(axis=0)
+
+    def collision_chance(self, hand: trimesh.Trimesh | HandShape, path: Any) -> Chances:
+        """The chance that a closed hand meets the object on its path; arrays of one number.
+
+        path (P, 4, 4): poses world_from_hand at which it is tested.
+        """
+        import trimesh
+
+        solid = trimesh.Trimesh(hand.vertices, hand.faces, process=False)
+        poses = nearest_rigid("path", frozen("path", path, (None, 4, 4), error=PoseError))
+        side = max(float(solid.extents.min()) / _NODES_ACROSS, _FINEST)
+        own = np.concatenate([np.asarray(solid.vertices), interior_lattice(solid, side)])
+        met = (self._distances(apply(poses, own).reshape(-1, 3)) < 0.0).any(axis=1)
+        return self._chances(np.reshape(met, (-1, 1)))
+
+    def grasp_chance(
+        self, world_from_gripper: Any, width: Any, gripper: Gripper | None = None
+    ) -> Chances:
+        """The chances (G,) that grasps work, as far as geometry says.
+
+        world_from_gripper (G, 4, 4), width (G,): between the fingers, metres; one number for all.
+        A grasp works where the fingers are free, something of the object is between their pads, and
+        the hand opens so far.
+        """
+        gripper = gripper or Gripper()
+        poses = frozen("world_from_gripper", world_from_gripper, (None, 4, 4), error=PoseError)
+        poses = nearest_rigid("world_from_gripper", poses)
+        widths = np.broadcast_to(np.asarray(width, dtype=np.float64), (len(poses),))
+        if not ((widths > 0.0) & np.isfinite(widths)).all():
+            raise SettingError("width is not above 0; accepted: metres between the fingers")
+        fingers, between = _nodes(gripper)
+        own = np.concatenate([fingers, between])  # of width 1, but for the fingers' thickness
+        count = len(fingers)
+        local = np.broadcast_to(own, (len(poses), *own.shape)).copy()
+        local[:, :count, 1] += np.sign(own[:count, 1]) * 0.5 * widths[:, None]
+        local[:, count:, 1] *= widths[:, None]
+        world = rotated(poses[:, None, :3, :3], local) + poses[:, None, :3, 3]
+        inside = self._distances(world.reshape(-1, 3)) < 0.0
+        inside = inside.reshape(len(self), len(poses), len(own))
+        free, held = ~inside[..., :count].any(axis=-1), inside[..., count:].any(axis=-1)
+        return self._chances(free & held & (widths <= gripper.opening))
+
+    def best_grasp(
+        self, object_from_gripper: Any, width: Any, gripper: Gripper | None = None
+    ) -> tuple[FloatArray, float]:
+        """The pose world_from_gripper (4, 4) that works with the largest chance, and this chance.
+
+        object_from_gripper (G, 4, 4), width (G,): grasps of the object, as planned on its mesh.
+        They are tried where some members have the object, the best and the modes' among them.
+        """
+        grasps = frozen("object_from_gripper", object_from_gripper, (None, 4, 4), error=PoseError)
+        if len(grasps) == 0:
+            raise SettingError("there is no grasp; accepted: at least one")
+        modes = [int(mode.members[0]) for mode in self.modes]
+        tried = [*dict.fromkeys([0, *modes, *evenly_spaced(len(self), _TRIED).tolist()])]
+        world = inverse(self.object_from_world[tried])[:, None]  # (T, 1, 4, 4)
+        turns = product(world[..., :3, :3], grasps[:, :3, :3])
+        places = rotated(world[..., :3, :3], grasps[:, :3, 3]) + world[..., :3, 3]
+        widths = np.broadcast_to(np.asarray(width, dtype=np.float64), places.shape[:2])
+        world = compose(turns, places).reshape(-1, 4, 4)
+        chance = self.grasp_chance(world, widths.reshape(-1), gripper).chance
+        return world[int(np.argmax(chance))], float(chance.max())
+
+    def _distances(self, points: Any) -> FloatArray:
+        """Signed distances (K, N) of world points from every member's surface."""
+        return signed_distances(self._sdf, self._poses, frozen("points", points, (None, 3)))
+
+    def _chances(self, works: np.ndarray) -> Chances:
+        """Shares of members (K, G) for which something holds."""
+        return wilson(works.mean(axis=0), len(works))
+
+    def _repr_png_(self) -> bytes:
+        """The outlines of all members from above and from the side, for notebooks."""
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(8.0, 4.0), layout="constrained")
+        world_from_object = inverse(self.object_from_world)
+        colors = np.full(len(self), "0.6", dtype=object)
+        for n, mode in enumerate(self.modes):
+            colors[mode.members] = f"C{n}"
+        for n, (across, up) in enumerate(((0, 1), (0, 2))):
+            axes = figure.add_subplot(1, 2, n + 1, aspect="equal")
+            for pose, color in zip(world_from_object, colors, strict=True):
+                seen = apply(pose, outline_in_object(self._sdf))
+                axes.plot(seen[:, across], seen[:, up], ".", color=color, ms=1.0, alpha=0.3)
+            axes.set(xlabel="xyz"[across] + " / m", ylabel="xyz"[up] + " / m")
+        file = io.BytesIO()
+        figure.savefig(file, format="png", dpi=80)
+        return file.getvalue()
+
+
+def wilson(share: Any, count: int) -> Chances:
+    """Shares (G,) of so many trials, with Wilson's 90 % interval."""
+    share, square = np.asarray(share, dtype=np.float64), _NORMAL**2 / count
+    middle = (share + 0.5 * square) / (1.0 + square)
+    half = _NORMAL * np.sqrt(share * (1.0 - share) / count + 0.25 * square / count) / (1.0 + square)
+    return Chances(share, np.maximum(middle - half, 0.0), np.minimum(middle + half, 1.0))
+
+
+def _nodes(gripper: Gripper) -> tuple[FloatArray, FloatArray]:
+    """Points of both fingers, from the opening outwards, and between the pads at width 1."""
+    across = 0.5 * gripper.width * np.linspace(-1.0, 1.0, 3)
+    outwards = gripper.thickness * np.array([1e-6, 1.0])  # the inner and the outer side
+    back, pad = -gripper.length * np.linspace(0.0, 1.0, 4), -gripper.pad * np.linspace(0, 1, 2)
+
+    def lattice(*axes: Sequence[float] | FloatArray) -> FloatArray:
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+    fingers = lattice(across, np.concatenate([-outwards, outwards]), back)
+    return fingers, lattice(across, np.linspace(-0.45, 0.45, 5), pad)
+
+
+def _nearest_alike(symmetry: ObjectSymmetry, own: FloatArray, others: FloatArray) -> FloatArray:
+    """Rotations (M, 3, 3) that look as others do, each as near to `own` (3, 3) as one can be."""
+    if symmetry.sphere:
+        return np.broadcast_to(own, others.shape)
+    alike = product(others[:, None], symmetry.rotations)  # (M, S, 3, 3)
+    if symmetry.axis is not None:
+        # tr(own^T R turn(t)) = a + b cos t + c sin t about the axis
+        relative = product(own.T, alike)
+        along = symmetry.axis[:, None] * symmetry.axis
+        b = (relative * (np.eye(3) - along)).sum(axis=(-2, -1))
+        c = (relative * hat(symmetry.axis).T).sum(axis=(-2, -1))
+        angles = arctangents(c, b)
+        turns = axis_angle(np.broadcast_to(symmetry.axis, (*angles.shape, 3)), angles)
+        alike = product(alike, turns)
+    best = np.argmin(rotation_angle(product(own.T, alike)), axis=1)
+    return alike[np.arange(len(alike)), best]
+
+
+def _rotation_vectors(turns: FloatArray) -> FloatArray:
+    """Axes times angles (M, 3), radians, of rotations (M, 3, 3)."""
+    double = twice_sine_axis(turns)
+    size = np.sqrt((double**2).sum(axis=1, keepdims=True))
+    return double * rotation_angle(turns)[:, None] / np.maximum(size, 1e-300)
