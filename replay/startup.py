@@ -24,6 +24,7 @@ EXTRAS = {
     "torch": ("torch",),
     "sim": ("pooch", "pybullet", "requests"),
     "sensors": ("PIL", "mcap_ros2", "yourdfpy"),
+    "serve": ("aiohttp",),
     "evaluate": ("bokeh", "cryptography", "dask", "distributed", "markdown_it", "matplotlib"),
 }
 """The modules that each extra of this package installs."""

@@ -17,7 +17,7 @@ from tests.runners.in_process import run
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 COMMANDS = ("align", "benchmark", "evaluate", "fetch", "plausible", "probe", "published")
-COMMANDS += ("real", "report", "simulate_rig")
+COMMANDS += ("real", "report", "serve", "simulate_rig")
 HEAVY = ("torch", "trimesh", "igl", "matplotlib", "pybullet", "networkx")
 LISTED = f"""
 import atexit, sys

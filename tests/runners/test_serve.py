@@ -1,0 +1,233 @@
+"""Sessions that other programs use: python -m runners.serve."""
+
+import asyncio
+import base64
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.error
+import urllib.request
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import trimesh
+from aiohttp import web
+
+import chsel
+from replay.comparing.verification import EQUAL, verify
+from replay.mcap.reader import read_recording
+from runners.serving.server import Server
+from tests.chsel.samples import REPOSITORY
+
+TOKEN = "a token"
+BOX, HAND = (trimesh.creation.box(sides) for sides in ((0.1, 0.06, 0.2), (0.02, 0.02, 0.1)))
+TARGET, OF_HAND = (
+    {"vertices": mesh.vertices.tolist(), "faces": mesh.faces.tolist()} for mesh in (BOX, HAND)
+)
+ON_BOX = [[-0.05, 0.02, 0.05], [-0.05, -0.02, -0.07], [0.05, 0.01, 0.08], [0.05, -0.01, -0.05]]
+ON_BOX += [[0.03, 0.02, 0.1], [-0.04, -0.02, 0.1], [0.0, -0.03, -0.04], [-0.02, 0.03, 0.05]]
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    """The address of a server in a thread, and the folder of its recordings."""
+    folder, listening = tmp_path_factory.mktemp("served"), socket.create_server(("127.0.0.1", 0))
+    options = {"sock": listening, "handle_signals": False, "print": None}
+    options["loop"] = asyncio.new_event_loop()
+    served = (Server(TOKEN, folder).app,)
+    threading.Thread(target=web.run_app, args=served, kwargs=options, daemon=True).start()
+    return f"127.0.0.1:{listening.getsockname()[1]}", folder
+
+
+def ask(address, path, body=None, *, token=TOKEN, **values):
+    """The status and the answer to JSON of values, or to a body; without both, to a GET."""
+    body = json.dumps(values).encode() if body is None and values else body
+    headers = {"Authorization": f"Bearer {token}"} if token else {}
+    request = urllib.request.Request(f"http://{address}{path}", body, headers)
+    try:
+        with urllib.request.urlopen(request) as answer:
+            return answer.status, json.load(answer)
+    except urllib.error.HTTPError as error:
+        return error.code, json.load(error)
+
+
+def opened(address, **values):
+    """The path of a new session of the box."""
+    status, answer = ask(address, "/sessions", target=TARGET, **values)
+    assert status == 200, answer
+    return f"/sessions/{answer['session']}"
+
+
+def outcomes(path):
+    """The steps that were verified, and how the recording ended."""
+    recording = read_recording(path)
+    verdicts = list(verify(recording))
+    assert {verdict.outcome for verdict in verdicts} == {EQUAL}
+    return [verdict.step for verdict in verdicts], recording.ended.outcome
+
+
+def test_two_clients_at_once_get_what_the_library_gives_and_recordings_repeat(server):
+    (address, folder), places = server, np.array([[0.4, 0.1, 0.2], [0.8, -0.1, 0.3]])
+
+    def client(number):
+        path = opened(address, seed=number, hand=OF_HAND, record=f"client_{number}.mcap")
+        contacts = (places[number] + ON_BOX).tolist()
+        ask(address, f"{path}/add", contacts=contacts[:4])
+        ask(address, f"{path}/register", b"")
+        _, probe = ask(address, f"{path}/next_probe", b"{}")
+        _, added = ask(address, f"{path}/add", contacts=contacts[4:])
+        assert added["points"] == {"known": 8, "free": 0, "occupied": 0}
+        _, found = ask(address, f"{path}/register", b"{}")
+        assert ask(address, f"{path}/close", b"") == (200, {"step": 1})
+        return probe, found
+
+    with ThreadPoolExecutor(2) as pool:
+        clients = list(pool.map(client, range(2)))
+    for number, (probe, found) in enumerate(clients):
+        with chsel.Session(BOX, seed=number, hand=HAND) as session:
+            session.add(contacts=(places[number] + ON_BOX)[:4])
+            session.register()
+            assert probe["world_from_hand"] == session.next_probe().world_from_hand.tolist()
+            session.add(contacts=(places[number] + ON_BOX)[4:])
+            assert found["object_from_world"] == session.register().object_from_world.tolist()
+            assert found["trust"]["text"] == str(session.trust)
+        poses = np.array(found["world_from_object"])
+        assert np.allclose(poses[0, :3, 3], places[number], atol=0.001)
+        assert np.allclose(poses @ found["object_from_world"], np.eye(4), atol=1e-12)
+        assert outcomes(folder / f"client_{number}.mcap") == ([0, 0, 1], "finished")
+
+
+def test_others_are_answered_during_a_registration_and_its_own_session_waits(server, monkeypatch):
+    address, _ = server
+    path, other = opened(address), opened(address)
+    entered, go_on, register = threading.Event(), threading.Event(), chsel.Session.register
+
+    def slow(session):
+        entered.set()
+        assert go_on.wait(60)
+        return register(session)
+
+    ask(address, f"{path}/add", contacts=ON_BOX)
+    monkeypatch.setattr(chsel.Session, "register", slow)
+    with ThreadPoolExecutor(2) as pool:
+        registered = pool.submit(ask, address, f"{path}/register", b"")
+        assert entered.wait(60)
+        added = pool.submit(ask, address, f"{path}/add", contacts=ON_BOX[:1])
+        assert ask(address, f"{other}/add", contacts=ON_BOX)[0] == 200
+        steps = {one["session"]: one["step"] for one in ask(address, "/sessions")[1]["sessions"]}
+        go_on.set()
+    assert [steps[one.rpartition("/")[2]] for one in (path, other)] == [0, 0]
+    assert registered.result()[1]["step"] == 0
+    assert added.result()[1]["step"] == 1
+
+
+def packed(shape, data=b"\0" * 24, dtype="float32"):
+    return {"dtype": dtype, "shape": shape, "base64": base64.b64encode(data).decode()}
+
+
+def test_a_mistake_is_one_line(server):
+    address, folder = server
+    path, box = opened(address), {"target": TARGET}
+    (folder / "there.mcap").touch()
+    for where, body, text in (
+        ("", [1], "the body is [1]; accepted: a JSON object"),
+        ("", {"target": 5}, "target is 5; accepted: the path of a mesh, or vertices and faces"),
+        ("", {"target": {"vertices": 0, "faces": None}}, "target: vertices has shape (); accepted"),
+        ("", {"seed": "x", "target": 0}, "open.seed is 'x'; accepted: an integer"),
+        ("", box | {"record": "../a.mcap"}, "record is '../a.mcap'; accepted: a name, of a file"),
+        ("", box | {"record": "there.mcap"}, f"recording {folder}/there.mcap"),
+        ("/add", {"contacts": [[1, 2]]}, "contacts has shape (1, 2); accepted: (any, 3)"),
+        ("/add", {"free": "x"}, "free is not an array of numbers; accepted: nested lists"),
+        ("/add", {"free": packed([3, 3])}, "free is not an array of numbers; accepted"),
+        ("/add", {"contact": [0, 0, None]}, "contact[0] is not finite"),
+        ("/add", {"contcts": []}, "a name in add is 'contcts'; accepted: contacts, free"),
+        ("/register", {}, "nothing is known yet; accepted: a registration after `add`"),
+        ("/next_probe", {"length": [1]}, "actions are incomplete; accepted:"),
+    ):
+        whole = f"{path}{where}" if where else "/sessions"
+        status, answer = ask(address, whole, json.dumps(body).encode())
+        assert (status, answer["error"][: len(text)]) == (400, text)
+        assert "\n" not in answer["error"]
+    assert ask(address, "/sessions", b"{")[1]["error"].startswith("the body is not JSON (Expecting")
+    assert [ask(address, f"{path}/close", b"")[0] for _ in range(2)] == [200, 404]
+    refused = "the token is missing or wrong; accepted: Authorization: Bearer TOKEN"
+    for token in ("", TOKEN[:-1], f"{TOKEN}."):
+        for where in ("/sessions", "/elsewhere"):
+            assert ask(address, where, token=token) == (401, {"error": refused})
+
+
+def test_a_client_that_hangs_up_leaves_the_session_and_its_recording_whole(server):
+    address, folder = server
+    path = opened(address, record="left.mcap")
+    head = f"POST {path}/{{}} HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {TOKEN}\r\n"
+    ask(address, f"{path}/add", contacts=ON_BOX)
+    for rest in (b"Content-Length: 99\r\n\r\n{", b"Content-Length: 2\r\n\r\n{}"):
+        with socket.create_connection(address.split(":")) as connection:
+            connection.sendall(head.format("register").encode() + rest)
+    status, answer = ask(address, f"{path}/register", b"{}")
+    assert (status, answer["step"]) == (200, 0)
+    ask(address, f"{path}/close", b"")
+    assert outcomes(folder / "left.mcap") == ([0], "finished")
+
+
+def test_packed_arrays_are_the_same_as_lists(server):
+    above = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.5], [0, 0, 0, 1]]
+    camera = {"camera": [[60, 0, 7.5], [0, 60, 5.5], [0, 0, 1]], "world_from_camera": above}
+    depth, mask = 470 + np.arange(192).reshape(12, 16), np.arange(192).reshape(12, 16) % 16 < 11
+    scaled = packed(depth.shape, depth.astype("<u2").tobytes(), "uint16") | {"scale": 0.001}
+    ways = {
+        "lists": {"depth": (0.001 * depth).tolist(), "mask": mask.tolist()},
+        "packed": {"depth": scaled, "mask": packed(mask.shape, mask.tobytes(), "uint8")},
+    }
+    for name, way in ways.items():
+        path = opened(server[0], record=f"{name}.mcap")
+        assert ask(server[0], f"{path}/add", **way, **camera)[0] == 200
+        ask(server[0], f"{path}/close", b"")
+    first, second = ((server[1] / f"{name}.mcap").read_bytes() for name in ways)
+    assert first == second
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there are no such signals on Windows")
+def test_the_command_serves_until_ctrl_c(tmp_path):
+    command = [sys.executable, "-m", "runners.serve", "port=0", f"folder={tmp_path}"]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    environment.pop("CHSEL_TOKEN", None)
+    served = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    lines = iter(served.stdout.readline, "")
+    address = next(found[1] for line in lines if (found := re.search(r"http://([\d.:]+)", line)))
+    token = next(lines).removeprefix("token: ").strip()
+    ask(address, "/sessions", token=token, target=TARGET, record="open.mcap")
+    ask(address, "/sessions/1/add", token=token, contacts=ON_BOX)
+    assert ask(address, "/sessions/1/register", b"", token=token)[0] == 200
+    served.send_signal(signal.SIGINT)
+    assert served.wait() == 0
+    assert outcomes(tmp_path / "open.mcap") == ([0], "interrupted")
+
+
+@pytest.mark.parametrize("kind", ["py", "cpp"])
+def test_clients_without_this_package_find_the_box(server, tmp_path, kind):
+    source = str(REPOSITORY / "examples" / f"serve_client.{kind}")
+    client = [sys.executable, "-I", source]
+    if kind == "cpp":
+        if shutil.which("c++") is None:
+            pytest.skip("there is no C++ compiler, c++")
+        client = [str(tmp_path / "client")]
+        subprocess.run(["c++", "-std=c++17", "-Wall", "-Werror", source, "-o", *client], check=True)
+    client.append(server[0].rpartition(":")[2])
+    done, refused = (
+        subprocess.run(client, env={"CHSEL_TOKEN": token}, capture_output=True, text=True)
+        for token in (TOKEN, "another")
+    )
+    assert done.returncode == 0, done.stderr
+    position = [float(number) for number in done.stdout.splitlines()[0].split()[1:]]
+    assert np.allclose(position, [0.4, 0.0, 0.1], atol=0.002)
+    assert refused.returncode == 1
+    assert "the token is missing or wrong" in refused.stderr
+    assert read_recording(server[1] / f"{kind}.mcap").ended.outcome == "finished"
