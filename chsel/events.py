@@ -61,14 +61,11 @@ class RigDescribed:
 
 @dataclass(frozen=True, eq=False)
 class ActionsOffered:
-    """The probes that a steered session offers, before the first; once.
-
-    A session is steered if its configuration has a group `policy`.
-    """
+    """The probes that a steered session offers, before the first decision and where they change."""
 
     topic: ClassVar[str] = "/actions"
 
-    step: int  # -1: before all steps
+    step: int  # of the last probe, -1 before the first
     actions: Actions
     hand: HandShape  # that takes them
 

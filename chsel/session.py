@@ -19,7 +19,16 @@ import numpy as np
 
 from chsel.api import method_settings
 from chsel.belief import Gripper, PoseBelief
-from chsel.errors import InputWarning, PointsError, PoseError, SettingError, quoted
+from chsel.errors import (
+    ChselError,
+    InputWarning,
+    PointsError,
+    PoseError,
+    SettingError,
+    quoted,
+    require_instance,
+    require_positive,
+)
 from chsel.events import (
     ActionsOffered,
     Decided,
@@ -49,11 +58,13 @@ from chsel.problem.points import (
     Workspace,
     check_contacts,
     check_points,
+    require_parts,
     workspace_around,
 )
 from chsel.problem.poses import nearest_rigid
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.sdf_grid import object_grid
+from chsel.problem.streams import StreamKey
 from chsel.problem.trust import check_trust
 from chsel.registration import Registered, one_line, register_recorded
 from chsel.rehearsal import warm_up, warm_up_policy, warm_up_sensing
@@ -67,7 +78,7 @@ FROM_SESSION = "session"
 """The code of warnings that come with the points."""
 _MOST_SHOWN = 200  # poses of a path, in recordings
 _ACROSS = 15.0  # to a diameter: points on the object that a depth image gives
-_UNIT = 1e-4  # m: of recorded depths
+_UNIT = 1e-4  # m: of recorded depths, up to 6.5 m; of others a multiple of it
 
 
 @dataclass(frozen=True)
@@ -135,12 +146,20 @@ class Session:
                 method_name, method_settings(method_name, preset, settings, sensor)
             )
         else:
-            method_name = _name_of(method, METHODS, build_method)
-        policy_name = (
-            policy if isinstance(policy, str) else _name_of(policy, POLICIES, build_policy)
-        )
-        policy = build_policy(policy) if isinstance(policy, str) else policy
-        self._hand = hand if isinstance(hand, HandShape | None) else HandShape.of(hand)
+            method_name = _name_of("method", method, METHODS, build_method)
+        if isinstance(policy, str):
+            policy_name, policy = policy, build_policy(policy)
+        else:
+            policy_name = _name_of("policy", policy, POLICIES, build_policy)
+        if not isinstance(hand, HandShape | None):
+            hand = HandShape.of(_mesh("hand", hand))
+        self._hand = hand
+        StreamKey(seed, 0)  # refuses what is no seed
+        require_positive("free_resolution", free_resolution)
+        grid = None
+        if workspace is not None:
+            require_parts(workspace=workspace)
+            grid = FreeGrid(workspace, free_resolution)
         sdf = object_grid(mesh, resolution)
         recorder, environment = _recorder(record, live)
         config = {
@@ -152,12 +171,11 @@ class Session:
             "seed": seed,
         }
         parts = name, "live", method_name, seed, config, mesh, sdf
-        box = workspace or Workspace.around(
-            np.zeros((1, 3)), sdf.diameter
-        )  # until there are points
-        given = box, free_resolution, KnownPoints(), None, environment
+        unknown = Workspace.around(np.zeros((1, 3)), sdf.diameter)  # until there are points
+        given = workspace or unknown, free_resolution, KnownPoints(), None, environment
         self._set_up(SessionStarted("session", *parts, *given), method, recorder)
-        self._policy, self._warns = policy, True
+        self._policy = policy
+        self._grid: FreeGrid | None = grid  # free space of what was added
         warm_up(method)
         warm_up_sensing()
         if self._hand is not None:
@@ -203,8 +221,9 @@ class Session:
         self._opening: tuple[InputWarning, ...] = ()
         self._interval = 0
         self._show: Callable[[str, int, int], None] = lambda *_: None
-        self._warns = self._begun = self._closed = False
-        self._grid: FreeGrid | None = None  # free space of what was added
+        self._begun = self._closed = False
+        self._new_warnings: list[InputWarning] = []  # that `register` has not given yet
+        self._grid = None
         self.steering: Steering | None = None
         self.step = -1
         self.outcome = self.failure = self.stop = ""
@@ -262,42 +281,58 @@ class Session:
         Raises ChselError for malformed input, with nothing added.
         """
         self._check_open()
-        spacing, diameter = self.started.free_resolution, self.started.sdf.diameter
-        contacts = np.concatenate([_rows("contacts", contacts), _rows("contact", contact)])
-        free_points, sdf = _rows("free", free), np.zeros(0) if known_sdf is None else known_sdf
-        others = KnownPoints(
-            np.zeros((0, 3)), _rows("occupied", occupied), _rows("known", known), sdf
-        )
-        poses = between = _path(path)
-        inside, look = np.zeros((0, 3)), None
-        if (hand is None) is not (len(poses) == 0):
+        if all(each is None for each in (contacts, free, occupied, known, path, contact, depth)):
+            raise PointsError("nothing was added; accepted: points, a path or a depth image")
+        if (hand is None) is not (path is None):
             raise PointsError("hand and path belong together; accepted: both or none")
-        if hand is not None:
+        image = [each is not None for each in (depth, camera, world_from_camera)]
+        if any(image) is not all(image) or (mask is not None and depth is None):
+            raise PointsError(
+                "depth, camera and world_from_camera belong together, with or without mask; "
+                "accepted: all of them or none"
+            )
+        spacing, diameter = self.started.free_resolution, self.started.sdf.diameter
+        contacts, free = _rows("contacts", contacts), _rows("free", free)
+        if contact is not None:
+            contacts = np.concatenate([contacts, frozen("contact", contact, (3,))[None]])
+        sdf = np.zeros(0) if known_sdf is None else known_sdf
+        others = KnownPoints(
+            occupied=_rows("occupied", occupied), known=_rows("known", known), known_sdf=sdf
+        )
+        inside, poses = np.zeros((0, 3)), np.zeros((0, 4, 4))
+        between, look = poses, None
+        if path is not None:
+            hand = _mesh("hand", hand)
+            poses = nearest_rigid("path", frozen("path", path, (None, 4, 4), error=PoseError))
             inside = interior_lattice(hand, 0.5 * spacing)
-            radius = float(np.abs(np.asarray(hand.vertices)).max())
+            radius = float(np.sqrt((hand.vertices**2).sum(axis=1)).max())
             between = poses_between(poses, step=0.5 * spacing, radius=radius)
         if depth is not None:
-            if camera is None or world_from_camera is None:
-                raise PointsError(
-                    "depth has no camera; accepted: camera and world_from_camera, too"
-                )
-            shape, places = _camera(camera, np.shape(depth)), diameter / _ACROSS
-            look = depth_look(depth, shape, world_from_camera, mask, before=spacing, side=places)
+            depth = frozen("depth", depth, (None, None), finite=False)
+            if mask is not None:
+                mask = frozen("mask", mask, (None, None), dtype=np.bool_)
+            seen_by, places = _camera(camera, depth), diameter / _ACROSS
+            look = depth_look(depth, seen_by, world_from_camera, mask, before=spacing, side=places)
             others = others.merged(KnownPoints(known=look.surface))
         touching = KnownPoints(known=contacts).merged(others)
         if self._begun:
-            check_points(self.online.points.merged(touching), diameter, spacing)
+            points = self.online.points.merged(touching)
+            check_points(points, diameter, spacing, self.started.workspace)
         else:
             check_points(touching, diameter, spacing)
-            around = touching if touching.count else KnownPoints(free=_places(free_points, poses))
+            passed = KnownPoints(free=np.concatenate([free, poses[:, :3, 3]]))
+            around = touching if touching.count else passed
             if around.count == 0:
-                raise PointsError("nothing was added; accepted: points, a motion or a depth image")
+                raise PointsError(
+                    "nothing says where the object can be; accepted: chsel.Session(..., "
+                    "workspace=...), or first points, a path or a mask"
+                )
             workspace = workspace_around(around, self.started.sdf)
+            self._grid = FreeGrid(workspace, spacing)
             self.started = replace(self.started, workspace=workspace)
             self._begin()
-        if self._grid is None:
-            self._grid = FreeGrid(self.started.workspace, spacing)
-        self._grid.at(free_points)
+        assert self._grid is not None
+        self._grid.at(free)
         self._grid.at(inside, poses=between)
         seen = np.zeros((0, 3))
         if look is not None:
@@ -346,18 +381,28 @@ class Session:
         """The plausible poses by all that is known, with how far to trust them (CHSEL, Alg. 1).
 
         The same result again if nothing was added since. Raises ChselError if nothing is known or
-        the points cannot be the object's.
+        the points cannot be the object's. Warns with InputWarning about points and results that
+        are hardly right.
         """
         self._check_open()
         if self.registered is not None:
             return self.registered.hypotheses
+        if self.failure:
+            raise PointsError(self.failure)
         if not self._begun or self.online.points.count == 0:
             raise PointsError("nothing is known yet; accepted: a registration after `add`")
         if self._decided == self.step:
             raise SettingError("a probe was chosen since; accepted: `register` before `next_probe`")
-        found = self.register_step()
-        self.flush()
-        return found
+        try:
+            return self.register_step()
+        except ChselError as error:
+            self.failed(error)
+            raise
+        finally:
+            self.flush()
+            given, self._new_warnings = self._new_warnings, []
+            for warning in given:
+                warnings.warn(warning, stacklevel=2)
 
     def register_step(self) -> Hypotheses:
         """The same, but that the recording may be behind, and what is given is not checked."""
@@ -391,12 +436,16 @@ class Session:
         self._recorder.record(Logged(self.step, "warning", f"no result: {self.failure}"))
 
     def actions(self, settings: ActionSettings | None = None) -> Actions:
-        """Straight probes from four sides and from above, see `chsel.ActionSettings`."""
+        """Straight probes from four sides and from above, where z is up and the floor at 0.
+
+        settings: by default those of the policy.
+        """
         self._require_hand()
         if not self._begun:
             raise SettingError("workspace is missing; accepted: workspace=, or points before this")
         assert self._hand is not None
-        return around_actions(settings or ActionSettings(), self.started.workspace, self._hand)
+        settings = settings or self._policy.settings.actions
+        return around_actions(settings, self.started.workspace, self._hand)
 
     def next_probe(
         self,
@@ -429,6 +478,8 @@ class Session:
                 return None
         if actions is None:
             actions = self.actions() if self.steering is None else self.steering.actions
+        accepted = "chsel.Actions(world_from_hand, length)"
+        require_instance("actions", actions, Actions, accepted)
         if not self._begun:
             raise SettingError("workspace is missing; accepted: workspace=, or points before this")
         if self.steering is None or actions.digest != self.steering.actions.digest:
@@ -492,9 +543,10 @@ class Session:
         self._closed = True
         level, step = "info" if outcome == "finished" else "warning", max(self.step, 0)
         try:
-            if self._begun:
-                self._recorder.record(Logged(step, level, f"session {outcome}"))
-                self._recorder.record(SessionEnded(step, outcome))
+            if not self._begun:
+                self._begin()
+            self._recorder.record(Logged(step, level, f"session {outcome}"))
+            self._recorder.record(SessionEnded(step, outcome))
         finally:
             self._recorder.close()
 
@@ -524,8 +576,7 @@ class Session:
                 step = max(self.step, 0)
                 self.warnings.append(StepWarning(step, warning.code, warning.text))
                 self._recorder.record(Logged(step, "warning", warning.text))
-                if self._warns:
-                    warnings.warn(warning, stacklevel=4)
+                self._new_warnings.append(warning)
 
     def _check_open(self) -> None:
         if self._closed:
@@ -546,8 +597,8 @@ def _recorder(record: str | Path | Recorder | None, live: bool) -> tuple[Recorde
 
     if isinstance(record, Recorder):
         return record, environment()
-    path = None if record is None else Path(record).expanduser()
-    if path is not None and path.suffix not in (".mcap", ".rrd"):
+    path = Path(record).expanduser() if isinstance(record, str | Path) else None
+    if record is not None and (path is None or path.suffix not in (".mcap", ".rrd")):
         raise SettingError(f"record is {quoted(str(record))}; accepted: a name.mcap or name.rrd")
     files = {path.suffix[1:]: path} if path is not None else {}
     return open_recorder(files.get("mcap"), files.get("rrd"), live=live), environment()
@@ -557,13 +608,22 @@ def _mesh_of(target: trimesh.Trimesh | str | Path) -> tuple[trimesh.Trimesh, str
     """The object's mesh, and its name."""
     if isinstance(target, str | Path):
         return load_mesh(target), Path(target).stem
-    if not hasattr(target, "faces"):
-        raise SettingError(f"target is {quoted(target)}; accepted: a mesh, or the path of its file")
-    return clean_mesh(target.vertices, target.faces, name="target"), "object"
+    mesh = _mesh("target", target)
+    return clean_mesh(mesh.vertices, mesh.faces, name="target"), "object"
 
 
-def _name_of(made: Any, names: tuple[str, ...], build: Callable[[str], Any]) -> str:
+def _mesh(name: str, given: Any) -> trimesh.Trimesh:
+    """What is given, if it is a mesh."""
+    import trimesh
+
+    require_instance(name, given, trimesh.Trimesh, "a mesh such as chsel.load_mesh(path)")
+    return given
+
+
+def _name_of(what: str, made: Any, names: tuple[str, ...], build: Callable[[str], Any]) -> str:
     """The name under which something is offered, by its class; else that of the class."""
+    if not hasattr(made, "settings"):
+        raise SettingError(f"{what} is {quoted(made)}; accepted: chsel.build_{what}(name), or name")
     offered = (name for name in names if type(build(name)) is type(made))
     return next(offered, type(made).__name__)
 
@@ -574,37 +634,23 @@ def _plain(settings: Any) -> dict[str, Any]:
 
 
 def _rows(name: str, given: Any) -> FloatArray:
-    """Points (N, 3), none for None; one point (3,) is a row."""
-    rows = np.zeros((0, 3)) if given is None else np.asarray(given, dtype=np.float64)
-    return frozen(name, rows[None] if rows.shape == (3,) else rows, (None, 3))
-
-
-def _path(path: Any) -> FloatArray:
-    """Poses world_from_hand (P, 4, 4), exactly rigid."""
-    if path is None:
-        return np.zeros((0, 4, 4))
-    return nearest_rigid("path", frozen("path", path, (None, 4, 4), error=PoseError))
-
-
-def _places(free: FloatArray, poses: FloatArray) -> FloatArray:
-    """Where something was without meeting the object (N, 3)."""
-    return np.concatenate([free, poses[:, :3, 3]])
+    """Points (N, 3), none for None."""
+    return frozen(name, np.zeros((0, 3)) if given is None else given, (None, 3))
 
 
 def _image(step: int, look: DepthLook) -> SensorImage:
     """A depth image as recordings have it."""
-    values = np.rint(look.depth / _UNIT).clip(0, 65535).astype(np.uint16)
+    unit = _UNIT * np.ceil(max(float(look.depth.max()) / (65535 * _UNIT), 1.0))
+    values = np.rint(look.depth / unit).astype(np.uint16)
     camera = look.camera
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    return SensorImage(step, "camera", "depth", values, _UNIT, look.rays, intrinsics, look.pose)
+    return SensorImage(step, "camera", "depth", values, unit, look.rays, intrinsics, look.pose)
 
 
-def _camera(camera: Any, shape: tuple[int, ...]) -> PinholeCamera:
+def _camera(camera: Any, depth: FloatArray) -> PinholeCamera:
     """The camera of an image (H, W), also of a matrix (3, 3)."""
     if isinstance(camera, PinholeCamera):
         return camera
     matrix = frozen("camera", camera, (3, 3), error=SettingError)
-    if len(shape) != 2:
-        raise PointsError(f"depth has shape {shape}; accepted: (rows, columns)")
-    focus = float(matrix[0, 0]), float(matrix[1, 1])
-    return PinholeCamera(shape[1], shape[0], *focus, float(matrix[0, 2]), float(matrix[1, 2]))
+    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
+    return PinholeCamera(depth.shape[1], depth.shape[0], fx, fy, cx, cy)

@@ -43,11 +43,13 @@ def frozen(
     *,
     dtype: Any = np.float64,
     error: type[ChselError] = PointsError,
+    finite: bool = True,
 ) -> NDArray[Any]:
     """A read-only, C-ordered copy of `value` with the given shape (None: any length).
 
     Takes numpy arrays, torch tensors and nested lists. Raises `error` with `name` in the message
-    if the value is not an array of numbers, has another shape, or holds a value that is not finite.
+    if the value is not an array of numbers, has another shape, or, where it must be finite, holds a
+    value that is not.
     """
     torch = sys.modules.get("torch")  # importing it takes seconds; a tensor's owner has done so
     try:
@@ -62,7 +64,7 @@ def frozen(
         array = np.zeros([0 if length is None else length for length in shape], dtype=dtype)
     elif not fits:
         raise error(f"{name} has shape {array.shape}; accepted: {_show(shape)}")
-    if not np.isfinite(array).all():
+    if finite and not np.isfinite(array).all():
         row = int(np.argwhere(~np.isfinite(array))[0][0]) if array.ndim else 0
         raise error(f"{name}[{row}] is not finite; accepted: finite numbers")
     array.setflags(write=False)

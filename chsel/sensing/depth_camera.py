@@ -25,6 +25,7 @@ _JUMP = 0.02  # m: between neighbouring pixels of different surfaces
 _REGION_JUMP = 0.01  # share of the depth: the same within a mask
 _PART = 0.05  # of the largest region of a mask: smaller ones are left out
 _OUTLINE = 2  # pixels by which a mask may be off
+_FARTHEST = 20.0  # m: of what a camera sees nearest
 
 
 @dataclass(frozen=True)
@@ -248,6 +249,8 @@ def depth_look(
     valid = valid_pixels(camera.image("depth", depth), nearest=0.0, furthest=np.inf)
     if not valid.any():
         raise PointsError("depth has no measurement; accepted: metres above 0")
+    if (nearest := float(depth[valid].min())) > _FARTHEST:
+        raise PointsError(f"the nearest depth is {nearest:g} m: millimetres? accepted: metres")
     depth = np.where(valid, depth, 0.0)
     rays = valid & ~occlusion_edges(depth, valid, _JUMP)
     surface = np.zeros((0, 3))
