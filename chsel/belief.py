@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from chsel.errors import PoseError, SettingError, require_positive
+from chsel.events import Believed
 from chsel.next_probe.decision_problem import HandShape
 from chsel.numerics.arrays import FloatArray, IntArray, evenly_spaced, frozen
 from chsel.numerics.elementary import arctangents
@@ -34,7 +35,8 @@ from chsel.problem.poses import (
 from chsel.problem.registration_problem import Hypotheses, Trust
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import CheckedSettings
-from chsel.problem.surface import outline_distances, outline_in_object, signed_distances
+from chsel.problem.streams import Purpose, StreamKey
+from chsel.problem.surface import outline_distances, signed_distances, surface_points
 from chsel.problem.trust import turned
 from chsel.sensing.free_space import interior_lattice
 
@@ -45,6 +47,7 @@ _NORMAL = 1.6449  # standard deviations: 90 % of a normal distribution are withi
 _SAME_MODE = 0.1  # of the diameter: as far as a mode moves from one result to the next
 _FINEST = 0.002  # m: nodes of a hand that collides
 _NODES_ACROSS = 5.0  # of a hand
+_DRAWN = 1500  # points of a surface
 _TRIED = 6  # members at whose poses grasps of the object are tried
 
 
@@ -168,6 +171,19 @@ class PoseBelief:
         vectors = np.concatenate([centres - centre, _rotation_vectors(turns)], axis=1)
         return np.asarray((vectors[:, :, None] * vectors[:, None]).mean(axis=0))
 
+    def event(self, step: int) -> Believed:
+        """As recordings of a session have it."""
+        poses = np.array([mode.object_from_world for mode in self.modes]).reshape(-1, 4, 4)
+        return Believed(
+            step,
+            np.array([mode.number for mode in self.modes], dtype=np.int64),
+            np.array([mode.weight for mode in self.modes]),
+            poses,
+            apply(inverse(poses), self._symmetry.centre[None])[:, 0],
+            np.array([mode.covariance for mode in self.modes]).reshape(-1, 6, 6),
+            self.spread,
+        )
+
     @property
     def spread(self) -> float:
         """Root mean square distance of two members' surfaces, metres."""
@@ -277,14 +293,16 @@ class PoseBelief:
 
         figure = Figure(figsize=(8.0, 4.0), layout="constrained")
         world_from_object = inverse(self.object_from_world)
+        stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
+        surface = surface_points(self._sdf, _DRAWN, stream)
         colors = np.full(len(self), "0.6", dtype=object)
         for n, mode in enumerate(self.modes):
             colors[mode.members] = f"C{n}"
         for n, (across, up) in enumerate(((0, 1), (0, 2))):
             axes = figure.add_subplot(1, 2, n + 1, aspect="equal")
             for pose, color in zip(world_from_object, colors, strict=True):
-                seen = apply(pose, outline_in_object(self._sdf))
-                axes.plot(seen[:, across], seen[:, up], ".", color=color, ms=1.0, alpha=0.3)
+                seen = apply(pose, surface)
+                axes.plot(seen[:, across], seen[:, up], ".", color=color, ms=1.0, alpha=0.1)
             axes.set(xlabel="xyz"[across] + " / m", ylabel="xyz"[up] + " / m")
         file = io.BytesIO()
         figure.savefig(file, format="png", dpi=80)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from chsel.next_probe.decision_problem import Actions, Decision, DecisionProblem, HandShape
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
@@ -180,6 +180,21 @@ class Decided:
     surprise: float
 
 
+@dataclass(frozen=True, eq=False)
+class Believed:
+    """What a program was told of a result, mode by mode; see `chsel.PoseBelief`."""
+
+    topic: ClassVar[str] = "/belief"
+
+    step: int
+    numbers: IntArray  # (M,), of the modes, the same from step to step
+    weights: FloatArray  # (M,), shares of the members
+    object_from_world: FloatArray  # (M, 4, 4), the best of each
+    centres: FloatArray  # (M, 3), of the object in these poses, world
+    covariances: FloatArray  # (M, 6, 6), of centres (metres) and rotation vectors (radians)
+    spread: float  # of the members, metres
+
+
 @dataclass(frozen=True)
 class Timed:
     """Wall-clock seconds by stage. With it no two recordings are equal to the byte."""
@@ -225,6 +240,7 @@ Event = (
     | HypothesesFound
     | Measured
     | Decided
+    | Believed
     | Timed
     | Logged
     | SessionEnded

@@ -528,6 +528,8 @@ class Session:
             symmetry = object_symmetry(self.started.mesh)
             self._belief = PoseBelief(self.started.sdf, self.answer, symmetry, self._belief)
             self._believed = self.answer
+            if self.registered is not None and not self._closed:
+                self._recorder.record(self._belief.event(self.step))
         return self._belief
 
     def end_points(self) -> None:

@@ -196,6 +196,15 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "digest": "string",  # of chosen to contacts
         "surprise": ("double", finite),
     },
+    "Belief": {
+        "step": "sint32",
+        "numbers": "i8[M]",
+        "weights": ("f8[M]", chances),
+        "object_from_world": ("f8[M,4,4]", rigid),
+        "centres": ("f8[M,3]", finite),
+        "covariances": ("f8[M,6,6]", finite),
+        "spread": ("double", between(0.0, 1e6, "m")),
+    },
     # No topic: this is the attachment "sdf_grid".
     "SdfGrid": {
         "origin": "f8[3]",
@@ -220,6 +229,7 @@ RECORDS: Mapping[str, str] = {
     "/sensor_image": "SensorImage",
     "/actions": "Actions",
     "/decision": "Decision",
+    "/belief": "Belief",
 }
 """Topics that carry messages of the table."""
 

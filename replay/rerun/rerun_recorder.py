@@ -166,6 +166,10 @@ class RerunRecorder(Recorder):
         self._clock.tick()  # what it led to is of a later moment
 
     @_draw.register
+    def _(self, event: events.Believed) -> None:
+        self._scene.show_modes(event)
+
+    @_draw.register
     def _(self, event: events.Timed) -> None:
         for stage, seconds in event.seconds.items():
             self._curves.add(f"seconds/{stage.replace(' ', '_')}", seconds)

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import rerun as rr
 
-from chsel.events import Probe
+from chsel.events import Believed, Probe
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.poses import inverse
+from chsel.problem.poses import inverse, quaternions
 from chsel.problem.registration_problem import Hypotheses
 from replay.colors import (
     CONTACT,
@@ -23,6 +23,7 @@ from replay.colors import (
     OBJECT,
     OCCUPIED,
     PAST,
+    SERIES,
     CostScale,
     Rgb,
     cost_colors,
@@ -47,6 +48,7 @@ _ALPHA = (48, 10)  # opacities of the lowest and the highest step, of 255
 _BEST_ALPHA = 150
 _DISPLAY_FACES = 6000  # meshes with more are coarsened for display
 _HAND_ALPHA = 80
+_LEAST_SIZE = 5e-4  # metres: half an ellipsoid's, to be seen
 
 
 class Scene:
@@ -119,6 +121,22 @@ class Scene:
         if self._has_hand:
             pose = path[None, deepest(path)] if len(path) else HIDDEN
             self._stream.log("scene/hand", mesh_poses(pose))
+
+    def show_modes(self, believed: Believed) -> None:
+        """Where the object's centre is in each mode: its ellipsoid of two standard deviations."""
+        squares, axes = np.linalg.eigh(believed.covariances[:, :3, :3])
+        axes[np.linalg.det(axes) < 0.0] *= -1.0
+        modes = rr.Ellipsoids3D(
+            centers=believed.centres,
+            half_sizes=np.maximum(2.0 * np.sqrt(np.maximum(squares, 0.0)), _LEAST_SIZE),
+            quaternions=quaternions(axes),
+            colors=[SERIES[number % len(SERIES)] for number in believed.numbers],
+            labels=[
+                f"mode {number}: {100.0 * weight:.0f} %"
+                for number, weight in zip(believed.numbers, believed.weights, strict=True)
+            ],
+        )
+        self._stream.log("scene/modes", modes)
 
     def _points(self, name: str, points: FloatArray, color: Rgb, *, size: float) -> None:
         drawn = rr.Points3D(points, colors=[color], radii=on_screen(size))

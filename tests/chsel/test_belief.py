@@ -8,10 +8,12 @@ import trimesh
 
 import chsel
 from chsel.belief import Gripper, PoseBelief, wilson
+from chsel.events import Believed
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.poses import axis_angle, compose, inverse, rotation_vector
 from chsel.problem.registration_problem import Hypotheses, Trust
 from chsel.problem.sdf_grid import SdfGrid
+from replay.mcap.reader import read_recording
 
 SIDES = np.array([0.20, 0.06, 0.08])
 BOX = trimesh.creation.box(SIDES)
@@ -145,3 +147,21 @@ def test_what_a_belief_does_not_accept():
             call()
     assert belief._repr_png_().startswith(b"\x89PNG")
     assert len(repr(belief).splitlines()) <= 5
+
+
+def test_a_belief_that_is_asked_for_is_recorded_and_a_sure_grasp_ends_touching(tmp_path):
+    contacts = trimesh.sample.sample_surface(L_SHAPE, 12, seed=1)[0]
+    hand = trimesh.creation.box([0.02, 0.02, 0.1])
+    above = compose(np.diag([1.0, -1.0, -1.0]), np.array([-0.05, 0.0, 0.03]))
+    with chsel.Session(L_SHAPE, record=tmp_path / "a.mcap", hand=hand) as session:
+        session.add(contacts=contacts)
+        session.register()
+        (mode,) = session.belief.modes
+        assert session.next_probe(grasps=(above[None], 0.07), sure=0.9) is None
+        assert session.stop == "grasp"
+    (told,) = [e for e in read_recording(tmp_path / "a.mcap").events() if isinstance(e, Believed)]
+    np.testing.assert_array_equal(told.object_from_world, mode.object_from_world[None])
+    np.testing.assert_array_equal(told.covariances, mode.covariance[None])
+    np.testing.assert_allclose(told.centres[0], L_SHAPE.centroid, atol=0.01)
+    assert (told.numbers.tolist(), told.weights.tolist()) == ([0], [1.0])
+    np.testing.assert_allclose(session.grasp[:3, 3], above[:3, 3], atol=0.005)
