@@ -75,7 +75,7 @@ def trust_by(method: Method, problem: RegistrationProblem, hypotheses: Hypothese
     """
     if not has_pose(hypotheses):
         return None
-    noise = noise_of(method)
+    noise, problem = noise_of(method), problem.carried(hypotheses.push_distance)
     trust = trust_in(problem, hypotheses, noise)
     searched = isinstance(method, Anchored) and len(problem.points.known) >= MANY_CONTACTS
     if trust.verdict == DETERMINED and not searched:

@@ -86,6 +86,7 @@ def trust_in(
     that is not above 0.
     """
     require_positive("sensor_noise", sensor_noise)
+    problem = problem.carried(hypotheses.push_distance)
     (poses, indices), sdf, points = _compared(hypotheses), problem.sdf, problem.points
     off = signed_distances(sdf, poses[:1], points.known)[0] - points.sdf
     noise = estimate_noise(off, sensor_noise)

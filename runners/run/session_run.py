@@ -10,6 +10,7 @@ from typing import Any
 from chsel.errors import ChselError, InputWarning
 from chsel.methods import noise_of
 from chsel.methods.method import Method
+from chsel.numerics.arrays import FloatArray
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.policies.steering import Steering
 from chsel.problem.online_registration import OnlineRegistration, OnlineStep
@@ -146,7 +147,7 @@ class SessionRun:
         self.failure = one_line(error)
         self._recorder.record(Logged(step, "warning", f"no result: {self.failure}"))
 
-    def _perceived(self) -> Iterator[tuple[int, KnownPoints]]:
+    def _perceived(self) -> Iterator[tuple[int, KnownPoints, FloatArray | None]]:
         """Record what the session yields, and hand on the new points of its probes."""
         begun = time.perf_counter()
         for event in self._events():
@@ -160,7 +161,7 @@ class SessionRun:
                 self._seconds = {"probe": time.perf_counter() - begun}
                 if self.steering is not None and self.steering.felt(event.contacts):
                     self._online.start_afresh(self.steering.policy.settings.surprise.larger)
-                yield event.step, event.new_points
+                yield event.step, event.new_points, event.push
                 begun = time.perf_counter()
 
     def _events(self) -> Iterator[SessionEvent]:
