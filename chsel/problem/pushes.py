@@ -11,6 +11,7 @@ from chsel.numerics.arrays import FloatArray, IntArray, ShapesShown, digest, fro
 from chsel.problem.points import KnownPoints
 
 CLASSES = ("free", "occupied", "known")
+_STEPS = 4
 _UNIT = 1e-6  # by which the length of a direction may be off
 
 
@@ -47,6 +48,11 @@ class Pushes(ShapesShown):
                     f"{counts.max()} {name} points were known before a push; accepted: at most "
                     f"{here}, as many as there are"
                 )
+
+    @property
+    def distances(self) -> list[float]:
+        """Distances of a push that are tried, metres, in equal steps from 0 to the largest."""
+        return [self.largest * n / _STEPS for n in range(_STEPS + 1)]
 
     @property
     def digest(self) -> str:

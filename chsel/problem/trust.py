@@ -135,6 +135,24 @@ def trust_in(
     )
 
 
+def fits_elsewhere(
+    problem: RegistrationProblem,
+    hypotheses: Hypotheses,
+    other: RegistrationProblem,
+    poses: Poses,
+    sensor_noise: float,
+) -> bool:
+    """Whether a pose far from the best hypothesis explains another problem about as well as that.
+
+    problem, other: of one object, that pushes have moved by different distances.
+    """
+    best, noise = Poses.of(hypotheses.object_from_world[:1]), noise_model(sensor_noise)
+    limit = pose_energies(problem, best, noise)[0] + LIMIT
+    apart = outline_distances_to(problem.sdf, poses, best)
+    width = max(MOST_WIDTH * problem.sdf.diameter, LEAST_LEVELS * sensor_noise)
+    return bool(((pose_energies(other, poses, noise) <= limit) & (apart > width)).any())
+
+
 def turned(sdf: SdfGrid, poses: Poses, pairs: BoolArray) -> BoolArray:
     """Which of some pairs (B, B) of poses are turned against each other, and by no symmetry.
 

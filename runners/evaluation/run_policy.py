@@ -98,11 +98,13 @@ def _row(
     }
     found = online.previous
     if found is not None and len(found.cost) > 0:
-        row["error"] = float(errors(found.object_from_world).mean())
+        distances = errors(found.object_from_world)
+        row |= {"error": float(distances.mean()), "best_error": float(distances[0])}
     if run.registered is not None and step.problem is not None:
         hypotheses = run.registered.hypotheses
         row |= {
             "hypotheses": len(hypotheses.cost),
+            "verdict": numbers.get("verdict"),
             "digest": hypotheses.digest,
             "problem_digest": step.problem.digest,
             "seconds": run.registered.total_seconds,

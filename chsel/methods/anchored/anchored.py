@@ -17,6 +17,7 @@ from chsel.problem.noise import NoiseModel, noise_model
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import Poses, compose, product, random_rotations, rotated
+from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import (
     Hypotheses,
     NullObserver,
@@ -60,7 +61,6 @@ _LEAST_LEFT = 3  # contacts that poses are sampled on if one is left out
 _TWINNED = 12  # basins whose poses are turned by near symmetries
 _MOST_GIVEN = 60  # of E_0 and E_l that are fitted
 _LEAST_PUSHES = 5  # of which a distance is estimated
-_DISTANCES = 4  # that are searched, up to the largest
 _HALVINGS = 2  # of the step between them, around the best
 _MOVED = 3.3  # nats: 99 % of a chi-squared distribution, half, of one more parameter
 
@@ -192,7 +192,7 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
     def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
         found = self._standing(problem, 0.0, observer)
         if problem.pushes is not None and len(problem.pushes.directions) >= _LEAST_PUSHES:
-            moved = self._moved(problem, problem.pushes.largest, observer)
+            moved = self._moved(problem, problem.pushes, observer)
             if moved.lowest < found.lowest - _MOVED:
                 found = moved
         hypotheses = found.search.hypotheses(found.search.spread(found.minima))
@@ -205,20 +205,20 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
         search = Search(problem.carried(distance), self.settings, observer)
         return Standing(distance, search, search.minima())
 
-    def _moved(self, problem: RegistrationProblem, largest: float, observer: Observer) -> Standing:
+    def _moved(self, problem: RegistrationProblem, pushes: Pushes, observer: Observer) -> Standing:
         """The same for the distance above 0 of lowest energy.
 
         The likelihood of the best pose has a maximum that a few searches find; between these, their
         minima are fitted again.
         """
-        step = largest / _DISTANCES
-        tried = [step * (n + 1) for n in range(_DISTANCES)]
-        best = min((self._standing(problem, d, observer) for d in tried), key=lambda s: s.lowest)
+        _, step, *others = pushes.distances
+        tried = [self._standing(problem, distance, observer) for distance in (step, *others)]
+        best = min(tried, key=lambda s: s.lowest)
         for _ in range(_HALVINGS):
             step *= 0.5
             near = [best]
             for distance in (best.distance - step, best.distance + step):
-                if distance <= largest:
+                if distance <= pushes.largest:
                     search = Search(problem.carried(distance), self.settings, observer)
                     fits = search.refined(search.rated(best.minima.poses))
                     near.append(Standing(distance, search, fits))

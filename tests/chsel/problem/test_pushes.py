@@ -7,6 +7,7 @@ import pytest
 
 from chsel import KnownPoints, OnlineRegistration, Pushes, trust_in
 from chsel.errors import PointsError, SettingError
+from chsel.methods import trust_by
 from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses, inverse
@@ -77,6 +78,17 @@ def test_the_distance_of_pushes_is_found_and_the_pose_is_that_of_the_end():
     assert still.push_distance == 0.0
     assert distance_to(truth, still) > 0.005
     assert trust_in(problem, found).misfit < 0.5 * trust_in(standing, still).misfit
+
+
+def test_after_a_push_of_unknown_distance_no_pose_is_determined():
+    points, method = known_points(STANDING, 12), Anchored(AnchoredSettings(size="small"))
+    loop = OnlineRegistration(GRID, WORKSPACE, SIDE, SETTINGS, points=points)
+    problem = loop.pose(0)
+    found, before = method.register(problem), [[len(points.free), 0, len(points.known)]]
+    for largest, verdict in ((0.001, "determined"), (0.03, "wide")):
+        pushed = replace(problem, pushes=Pushes([DIAGONAL], before, largest))
+        assert method.register(pushed).digest == found.digest
+        assert trust_by(method, pushed, found).verdict == verdict
 
 
 def test_an_object_that_stands_has_the_same_result_as_if_nobody_spoke_of_pushes():
