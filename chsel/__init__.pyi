@@ -27,6 +27,7 @@ from .problem.mesh import load_mesh as load_mesh
 from .problem.online_registration import OnlineRegistration as OnlineRegistration
 from .problem.points import KnownPoints as KnownPoints
 from .problem.points import Workspace as Workspace
+from .problem.pushes import Pushes as Pushes
 from .problem.registration_problem import ArchiveSnapshot as ArchiveSnapshot
 from .problem.registration_problem import Hypotheses as Hypotheses
 from .problem.registration_problem import RegistrationProblem as RegistrationProblem

@@ -25,6 +25,7 @@ from chsel.problem.points import (
     require_parts,
     workspace_around,
 )
+from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import Hypotheses, Observer
 from chsel.problem.sdf_grid import SdfGrid, object_grid
 from chsel.problem.settings import changed_settings
@@ -48,6 +49,7 @@ def register(
     hypotheses: int | None = None,
     workspace: Workspace | None = None,
     initial_set: Any = None,
+    pushes: Pushes | None = None,
     previous: Hypotheses | None = None,
     resolution: float | None = None,
     free_resolution: float = FREE_RESOLUTION,
@@ -65,6 +67,8 @@ def register(
     {"size": "large"}, or a whole settings object.
     hypotheses: B, 30 by default. workspace: where the object can be; by default the bounds of the
     points padded by the object's diameter. initial_set (B, 4, 4): E_0 as object_from_world.
+    pushes: that may have moved the object while points became known, counted as free, occupied and
+    known, of which surface comes first; `anchored` finds where it is now.
     previous: the last result, when points were added since (CHSEL, Alg. 2). resolution: of the
     SDF grid of a mesh, metres; by default that of `SdfGrid.from_mesh`. The grid is kept for the
     next call with this mesh. free_resolution: voxel side of free space, metres; used by free_term
@@ -100,6 +104,10 @@ def register(
     problem = online.pose(step)
     if initial_set is not None:
         problem = replace(problem, initial_set=initial_set)
+    if pushes is not None:
+        what = "chsel.Pushes(directions, before, largest)"
+        require_instance("pushes", pushes, Pushes, what)
+        problem = replace(problem, pushes=pushes)
     result = solver.register(problem, observer)
     trust = trust_by(solver, problem, result)
     if trust is not None:

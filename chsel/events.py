@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -19,6 +20,8 @@ from chsel.problem.sdf_grid import SdfGrid
 
 if TYPE_CHECKING:
     import trimesh
+
+_LEAST_SIDEWAYS = 0.2  # horizontal part of the direction of a push that moves the object
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +104,20 @@ class Probe:
     contacts: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     # (C, 3): unit, pointing out of the object, zero where unknown.
     contact_normals: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    # (4, 4): the true pose after the probe, where that moved the object and it is known.
+    world_from_object: FloatArray | None = None
+
+    @property
+    def push(self) -> FloatArray | None:
+        """In which direction (3,) a hand that probes along its z axis has pushed the object.
+
+        A horizontal unit vector; None without a contact, for unknown paths, and for pushes down.
+        """
+        if self.outcome != "contact" or len(self.gripper_path) == 0:
+            return None
+        x, y, _ = self.gripper_path[-1, :3, 2].tolist()
+        length = math.sqrt(x * x + y * y)
+        return np.array([x, y, 0.0]) / length if length > _LEAST_SIDEWAYS else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -123,6 +123,7 @@ class Session:
         noise: float | None = None,
         resolution: float | None = None,
         free_resolution: float = FREE_RESOLUTION,
+        moves: float = 0.0,
         seed: int = 0,
         record: str | Path | Recorder | None = None,
         live: bool = False,
@@ -133,7 +134,8 @@ class Session:
         `chsel.register` takes them, or a method of `build_method`. noise: standard deviation of the
         sensor, metres, for methods with such a setting. policy: of `next_probe`, a name or what
         `build_policy` gives. hand: that probes along the z axis of its frame, metres.
-        workspace: where the object can be; by default it follows from the first points. seed: of
+        workspace: where the object can be; by default it follows from the first points. moves:
+        metres that a touch moves the object at most, along the hand's way. seed: of
         the random streams. record: a new file .mcap or .rrd, or a recorder of one's own. live: show
         the session in the Rerun viewer.
         Raises ChselError for what cannot be used, and RecordingError if the file exists.
@@ -156,6 +158,7 @@ class Session:
         self._hand = hand
         StreamKey(seed, 0)  # refuses what is no seed
         require_positive("free_resolution", free_resolution)
+        require_positive("moves", moves, zero=True)
         grid = None
         if workspace is not None:
             require_parts(workspace=workspace)
@@ -164,7 +167,7 @@ class Session:
         recorder, environment = _recorder(record, live)
         config = {
             "object": {"name": name},
-            "session": {"kind": "live"},
+            "session": {"kind": "live"} | ({"moves": moves} if moves else {}),
             "method": {"name": method_name, **_plain(method.settings)},
             "policy": {"name": policy_name, **_plain(policy.settings)},
             "preset": {"name": preset},
@@ -174,7 +177,7 @@ class Session:
         unknown = Workspace.around(np.zeros((1, 3)), sdf.diameter)  # until there are points
         given = workspace or unknown, free_resolution, KnownPoints(), None, environment
         self._set_up(SessionStarted("session", *parts, *given), method, recorder)
-        self._policy = policy
+        self._policy, self._moves = policy, moves
         self._grid: FreeGrid | None = grid  # free space of what was added
         warm_up(method)
         warm_up_sensing()
@@ -217,11 +220,13 @@ class Session:
 
     def _set_up(self, started: SessionStarted, method: Method, recorder: Recorder) -> None:
         self.started, self.method, self._recorder = started, method, recorder
+        self._truth = started.world_from_object  # where the object is now, where that is known
         self._symmetry: ObjectSymmetry | None = None
         self._opening: tuple[InputWarning, ...] = ()
         self._interval = 0
         self._show: Callable[[str, int, int], None] = lambda *_: None
         self._begun = self._closed = False
+        self._moves = 0.0
         self._new_warnings: list[InputWarning] = []  # that `register` has not given yet
         self._grid = None
         self.steering: Steering | None = None
@@ -249,6 +254,7 @@ class Session:
             self.method.online,
             seed=started.seed,
             points=started.initial_points,
+            push_distance=self._moves,
         )
         self._recorder.record(started)
         self._begun = True
@@ -341,17 +347,17 @@ class Session:
             self._recorder.record(_image(self.step + 1, look))
         now_free = outside_of(seen, self._grid.new(), spacing)
         outcome = "contact" if len(contacts) else "points" if others.count else "free"
-        shown = poses[evenly_spaced(len(poses), _MOST_SHOWN)]
-        self.observe(
-            Probe(
-                step=self.step + 1,
-                outcome="points" if look is not None else outcome,
-                new_points=KnownPoints(free=now_free).merged(touching),
-                gripper_path=shown,
-                contacts=contacts,
-                contact_normals=np.zeros_like(contacts),
-            )
+        probe = Probe(
+            step=self.step + 1,
+            outcome="points" if look is not None else outcome,
+            new_points=KnownPoints(free=now_free).merged(touching),
+            gripper_path=poses[evenly_spaced(len(poses), _MOST_SHOWN)],
+            contacts=contacts,
+            contact_normals=np.zeros_like(contacts),
         )
+        if self._moves and probe.push is not None:  # what was free has moved with the object
+            self._grid = FreeGrid(self.started.workspace, spacing)
+        self.observe(probe)
         self.flush()
 
     def observe(self, event: Event) -> None:
@@ -375,7 +381,9 @@ class Session:
             and steering.felt(event.contacts)
         ):
             self.online.start_afresh(steering.policy.settings.surprise.larger)
-        self.online.points = self.online.points.merged(event.new_points)
+        if event.world_from_object is not None:
+            self._truth = event.world_from_object
+        self.online.perceive(event.new_points, event.push)
 
     def register(self) -> Hypotheses:
         """The plausible poses by all that is known, with how far to trust them (CHSEL, Alg. 1).
@@ -418,7 +426,7 @@ class Session:
             ProblemPosed(problem.key.step, problem),
             self.method,
             self._recorder,
-            self.started.world_from_object,
+            self._truth,
             self._symmetry,
             snapshot_interval=self._interval,
             show=self._show,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from chsel.errors import require_choice
@@ -21,7 +22,15 @@ from chsel.methods.svgd import Svgd, SvgdSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.settings import PRESETS, Entry, NamedChoices
-from chsel.problem.trust import DETERMINED, MANY_CONTACTS, SENSOR_NOISE, has_pose, trust_in
+from chsel.problem.trust import (
+    DETERMINED,
+    MANY_CONTACTS,
+    SENSOR_NOISE,
+    WIDE,
+    fits_elsewhere,
+    has_pose,
+    trust_in,
+)
 
 _OURS: dict[str, Entry[Method]] = {
     "chsel": (Chsel, ChselSettings()),
@@ -71,14 +80,22 @@ def trust_by(method: Method, problem: RegistrationProblem, hypotheses: Hypothese
 
     A single mode has to stand beside what a search for other poses finds, among them turns under
     which the object looks nearly alike, and poses that leave out one of few contacts. Of many
-    contacts, `anchored` has done this search itself.
+    contacts, `anchored` has done this search itself. Where pushes may have moved the object, also
+    beside what is found for other distances of them.
     """
     if not has_pose(hypotheses):
         return None
-    noise = noise_of(method)
+    noise, pushes, posed = noise_of(method), problem.pushes, problem
+    problem = posed.carried(hypotheses.push_distance)
     trust = trust_in(problem, hypotheses, noise)
     searched = isinstance(method, Anchored) and len(problem.points.known) >= MANY_CONTACTS
     if trust.verdict == DETERMINED and not searched:
         rivals = Anchored(AnchoredSettings(noise=noise)).minima(problem)
         trust = trust_in(problem, hypotheses, noise, rivals)
+    if trust.verdict == DETERMINED and pushes is not None:
+        search = Anchored(AnchoredSettings(noise=noise))
+        others = [posed.carried(distance) for distance in pushes.distances]
+        found = ((other, search.minima(other)) for other in others)
+        if any(fits_elsewhere(problem, hypotheses, *one, noise) for one in found):
+            trust = replace(trust, verdict=WIDE, modes=0)
     return trust

@@ -19,6 +19,7 @@ from chsel.problem.poses import (
     random_rotations,
     rotation_vector,
 )
+from chsel.problem.pushes import CLASSES, Pushes
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
@@ -123,7 +124,7 @@ class OnlineStep:
 
 
 class OnlineRegistration:
-    """Registers an object that does not move after every change of its known points.
+    """Registers an object after every change of its known points.
 
     sdf: of the object. points: all that are known, in the world. previous: the result that the
     next problem follows from; None before the first.
@@ -142,12 +143,14 @@ class OnlineRegistration:
         start: Start = _AT_ONCE,
         only: Container[int] | None = None,
         sensor_noise: float = SENSOR_NOISE,
+        push_distance: float = 0.0,
     ) -> None:
         """settings: how E_0 and E_l follow from the result before, `method.online` of a method.
 
         free_resolution: voxel side of free space, metres. seed: of the random streams of all
         steps. points: known before the first step. only: steps that register; None for all.
         sensor_noise: of known points, metres, by which results are judged, see `trust_in`.
+        push_distance: metres that a push moves the object at most; 0 if it stands still.
         """
         points = KnownPoints() if points is None else points
         require_parts(sdf=sdf, workspace=workspace, points=points)
@@ -156,26 +159,28 @@ class OnlineRegistration:
         self._settings, self._seed = settings, seed
         self._start, self._only, self._sensor_noise = start, only, sensor_noise
         self._larger = 1
+        self._push_distance = push_distance
+        self._pushes: list[tuple[FloatArray, list[int]]] = []  # directions, and points before
         self.points = points
         self.previous = previous
 
     def steps(
         self,
-        perceived: Iterable[tuple[int, KnownPoints]],
+        perceived: Iterable[tuple[int, KnownPoints] | tuple[int, KnownPoints, FloatArray | None]],
         register: Callable[[RegistrationProblem], Hypotheses | None] | None = None,
         catch: type[Exception] | tuple[type[Exception], ...] = (),
     ) -> Iterator[OnlineStep]:
         """Algorithm 2; yields after every step, whether or not it registered.
 
         perceived: steps in ascending order with the points that are new in each, such as
-        enumerate(points). register: finds E, such as `method.register`, or None where it finds
+        enumerate(points); as a third, the direction of a push that came then, see `perceive`.
+        register: finds E, such as `method.register`, or None where it finds
         nothing to remember; without it problems are posed only, and `remember` takes results from
         elsewhere. catch: errors of a step that do not end the loop; the next problem then follows
         from the last result that there was.
         """
-        for step, new_points in perceived:
-            require_parts(points=new_points)
-            self.points = self.points.merged(new_points)  # X <- perceived from environment
+        for step, new_points, *push in perceived:
+            self.perceive(new_points, *push)  # X <- perceived from environment
             problem = hypotheses = failure = None
             if self.enough(step):
                 try:
@@ -190,6 +195,17 @@ class OnlineRegistration:
             if hypotheses is not None:
                 self.remember(hypotheses)
             yield OnlineStep(step, problem, hypotheses, failure)
+
+    def perceive(self, new_points: KnownPoints, push: FloatArray | None = None) -> None:
+        """Take new points, and the direction (3,) in which the object was then pushed, if it was.
+
+        The direction is a unit vector in the world. It counts where `push_distance` is above 0.
+        """
+        require_parts(points=new_points)
+        self.points = self.points.merged(new_points)
+        if push is not None:
+            before = [len(getattr(self.points, name)) for name in CLASSES]
+            self._pushes.append((push, before))
 
     def enough(self, step: int) -> bool:
         """Whether a step registers, with the points that are known."""
@@ -216,8 +232,13 @@ class OnlineRegistration:
                 low_cost_set = self.previous.elites
             elif settings.low_cost_set == "estimates":
                 low_cost_set = self.previous.object_from_world
-        around = self._workspace, self._free_resolution
-        return RegistrationProblem(self.sdf, self.points, initial_set, *around, key, low_cost_set)
+        around, pushes = (self._workspace, self._free_resolution), None
+        if self._push_distance > 0.0 and self._pushes:
+            directions, before = zip(*self._pushes, strict=True)
+            pushes = Pushes(np.array(directions), np.array(before), self._push_distance)
+        return RegistrationProblem(
+            self.sdf, self.points, initial_set, *around, key, low_cost_set, pushes
+        )
 
     def start_afresh(self, larger: int = 1) -> None:
         """Let the next problem be a first one, with so many times the hypotheses."""

@@ -202,6 +202,10 @@ class FreeVoxels:
         self._seen.update(new)
         return self.lattice.centres(np.array(new, dtype=np.int64).reshape(-1, 3))
 
+    def forget(self) -> None:
+        """Let the next points be new again, as after the object has moved."""
+        self._seen.clear()
+
     def holds(self, points: FloatArray) -> BoolArray:
         """Which points (N, 3) are in a voxel added so far."""
         voxels = map(tuple, self.lattice.voxels(points).tolist())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -13,6 +13,7 @@ from chsel.errors import PoseError, SettingError, require_between, require_posit
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, ShapesShown, digest, frozen
 from chsel.problem.points import KnownPoints, Workspace, require_parts
 from chsel.problem.poses import check_rigid
+from chsel.problem.pushes import Pushes
 from chsel.problem.sdf_grid import COARSEST, FINEST, SdfGrid
 from chsel.problem.streams import StreamKey
 
@@ -30,6 +31,7 @@ class RegistrationProblem(ShapesShown):
     low_cost_set: FloatArray = field(  # E_l (L, 4, 4), object_from_world; may be empty
         default_factory=lambda: np.zeros((0, 4, 4))
     )
+    pushes: Pushes | None = None  # that may have moved the object; None: it stands still
 
     def __post_init__(self) -> None:
         require_parts(sdf=self.sdf, points=self.points, workspace=self.workspace)
@@ -43,15 +45,28 @@ class RegistrationProblem(ShapesShown):
             raise PoseError("initial_set is empty; accepted: at least one pose")
         if self.points.count == 0:
             raise SettingError("there is no known point; accepted: at least one of any class")
+        if self.pushes is not None:
+            self.pushes.require_points(self.points)
 
     @cached_property
     def digest(self) -> str:
         """Digest of the problem."""
         parts = [self.sdf.digest, self.points.digest, digest(self.initial_set, self.low_cost_set)]
+        parts += [] if self.pushes is None else [self.pushes.digest]
         numbers = np.array([*self.workspace.lower, *self.workspace.upper, self.free_resolution])
         key = np.array([self.key.seed, self.key.step], dtype=np.uint64)
         text = np.frombuffer("".join(parts).encode(), dtype=np.uint8)
         return digest(text, numbers, key)
+
+    def carried(self, distance: float) -> RegistrationProblem:
+        """The problem of an object that stands still where pushes have moved it to.
+
+        distance: of one push, metres. Its points have moved with it, and there are no pushes left.
+        """
+        if self.pushes is None:
+            return self
+        points = self.pushes.carried(self.points, distance, self.free_resolution)
+        return replace(self, points=points, pushes=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +163,7 @@ class Hypotheses:
     # not say. Decisions on the next probe weigh them up; they are not part of the digest.
     candidates: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))
     trust: Trust | None = None  # methods leave it out; who calls them adds it, see `chsel.trust_in`
+    push_distance: float = 0.0  # metres that each push of the problem moved the object, estimated
 
     def __repr__(self) -> str:
         best = f", best cost {self.cost[0]:.4g}" if len(self.cost) else ""
@@ -163,7 +179,7 @@ class Hypotheses:
     def digest(self) -> str:
         """Digest of poses, costs, flags and elites."""
         parts = (self.object_from_world, self.cost, self.duplicate, self.cell, self.elites)
-        return digest(*parts)
+        return digest(*parts, *([np.array([self.push_distance])] if self.push_distance else []))
 
 
 class Observer(Protocol):

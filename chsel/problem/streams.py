@@ -43,6 +43,7 @@ class Purpose(IntEnum):
     FAULTS = 17
     PRIOR_BELIEF = 18
     POLICY = 19
+    PUSHES = 20
 
 
 @dataclass(frozen=True)

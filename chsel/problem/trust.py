@@ -86,6 +86,7 @@ def trust_in(
     that is not above 0.
     """
     require_positive("sensor_noise", sensor_noise)
+    problem = problem.carried(hypotheses.push_distance)
     (poses, indices), sdf, points = _compared(hypotheses), problem.sdf, problem.points
     off = signed_distances(sdf, poses[:1], points.known)[0] - points.sdf
     noise = estimate_noise(off, sensor_noise)
@@ -132,6 +133,24 @@ def trust_in(
     return Trust(
         noise.sigma, noise.outliers, misfit, count, spread, verdict, redundancy, best, twins
     )
+
+
+def fits_elsewhere(
+    problem: RegistrationProblem,
+    hypotheses: Hypotheses,
+    other: RegistrationProblem,
+    poses: Poses,
+    sensor_noise: float,
+) -> bool:
+    """Whether a pose far from the best hypothesis explains another problem about as well as that.
+
+    problem, other: of one object, that pushes have moved by different distances.
+    """
+    best, noise = Poses.of(hypotheses.object_from_world[:1]), noise_model(sensor_noise)
+    limit = pose_energies(problem, best, noise)[0] + LIMIT
+    apart = outline_distances_to(problem.sdf, poses, best)
+    width = max(MOST_WIDTH * problem.sdf.diameter, LEAST_LEVELS * sensor_noise)
+    return bool(((pose_energies(other, poses, noise) <= limit) & (apart > width)).any())
 
 
 def turned(sdf: SdfGrid, poses: Poses, pairs: BoolArray) -> BoolArray:

@@ -125,6 +125,7 @@ class _SessionAgain:
         self._result_known = True
         self._surprise: float | None = 0.0  # of the last probe, None if it cannot be known
         self._before: Decided | None = None
+        self._truth = recording.start.world_from_object
         if recording.offered is not None:
             self._policy = recorded_policy(recording)
 
@@ -137,7 +138,8 @@ class _SessionAgain:
             self._steering = Steering(self._policy.build(), *given, event.actions, event.hand)
         if not isinstance(event, Probe):
             return
-        self._online.points = self._online.points.merged(event.new_points)
+        self._online.perceive(event.new_points)
+        self._truth = self._truth if event.world_from_object is None else event.world_from_object
         before, self._surprise = self._before, None
         if before is None or before.step != event.step - 1 or before.decision.chosen < 0:
             return
@@ -199,12 +201,14 @@ class _SessionAgain:
     def _register(self, posed: ProblemPosed, recorded: Sequence[Event]) -> Again:
         start, step, recorder = self._recording.start, posed.step, ListRecorder()
         try:
-            problem = posed.problem if self._lost else self._online.pose(step)
+            problem = posed.problem
+            if not self._lost:
+                problem = replace(self._online.pose(step), pushes=problem.pushes)
             registered = register_recorded(
                 ProblemPosed(step, problem) if self._anew else posed,
                 self._method,
                 recorder,
-                start.world_from_object,
+                self._truth,
                 symmetry_for_errors(start),
                 snapshot_interval=snapshot_interval(self._recording.snapshots(step)),
             )

@@ -133,7 +133,7 @@ def compared(
         warm_up(method)  # so that no time holds the compiling of kernels
     for posed in _problems(recording, steps):
         step, judge = posed.step, CompiledCost.of(posed.problem, cost.settings)
-        sets = (judge, recording.start, posed.problem, plausible)
+        sets = (judge, recording.start_at(posed.step), posed.problem, plausible)
         recorded = recording.hypotheses(step) if recording.has_result(step) else None
         numbers = {} if recorded is None else _all_numbers(recorded, *sets)
         failure = "" if recorded is not None else "no result was recorded"
@@ -250,7 +250,7 @@ def _register(
         posed,
         method,
         recorder,
-        start.world_from_object,
+        recording.start_at(posed.step).world_from_object,
         symmetry_for_errors(start),
         snapshot_interval=snapshot_interval(recording.snapshots(posed.step)),
     )

@@ -29,6 +29,7 @@ from chsel.next_probe.decision_problem import Actions, Belief, Decision, Decisio
 from chsel.numerics.arrays import digest
 from chsel.problem.mesh import mesh_digest
 from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import ArchiveSnapshot, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
@@ -131,7 +132,9 @@ def config_from_json(text: str) -> dict[str, Any]:
 def _problem_values(event: ProblemPosed) -> dict[str, Any]:
     """The message `Problem`, with its low-cost set."""
     problem = event.problem
+    pushes = problem.pushes
     return shared_values("Problem", problem) | {
+        "pushes": None if pushes is None else shared_values("Pushes", pushes),
         "step": event.step,
         "workspace": problem.workspace.bounds,
         "key_seed": problem.key.seed,
@@ -167,6 +170,7 @@ class RecordedProblem:
             "key": StreamKey(values["key_seed"], values["key_step"]),
             "sdf": sdf,
             "points": points,
+            "pushes": None if values["pushes"] is None else Pushes(**values["pushes"]),
         }
         problem = RegistrationProblem(**shared_arguments(RegistrationProblem, values) | parts)
         check_digest(f"the problem of step {self.step}", problem.digest, values["digest"])

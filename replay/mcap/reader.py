@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -88,6 +89,12 @@ class Recording:
                 yield entry
             elif images:
                 yield self._next(seen, entry)
+
+    def start_at(self, step: int) -> SessionStarted:
+        """The start of the session with the true pose after a step, which pushes may change."""
+        before = [p.world_from_object for p in self.probes if p.step <= step]
+        moved = [pose for pose in before if pose is not None]
+        return replace(self.start, world_from_object=moved[-1]) if moved else self.start
 
     def sensor_images(self, steps: Sequence[int] | None = None) -> Iterator[SensorImage]:
         """The images of some steps (None: of all) in their order, read one at a time."""

@@ -86,6 +86,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "gripper_path": ("f8[P,4,4]", rigid),
         "contacts": ("f8[C,3]", finite),
         "contact_normals": ("f8[C,3]", finite),
+        "world_from_object": ("f8[4,4]?", rigid),
     },
     # Closes a session's start and every probe, after the point clouds that it counts.
     "KnownPoints": {
@@ -98,6 +99,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "occupied": "uint64",
         "known": "uint64",
     },
+    "Pushes": {"directions": "f8[P,3]", "before": "i8[P,3]", "largest": "double"},
     "Problem": {
         "step": "sint32",
         "initial_set": ("f8[B,4,4]", not_empty, rigid),
@@ -109,6 +111,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "points_digest": "string",
         "sdf_digest": "string",
         "digest": "string",
+        "pushes": "Pushes?",
     },
     "ArchiveSnapshot": {
         "step": "sint32",
@@ -143,6 +146,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "archive": "ArchiveSnapshot?",
         "archive_is_last_snapshot": "bool",  # then `archive` is absent
         "digest": "string",
+        "push_distance": ("double", between(0.0, 1.0, "m")),
     },
     "Measured": {"step": "sint32", "values": ("Number*", short_names)},
     "Timed": {"step": "sint32", "seconds": ("Number*", short_names, finite)},

@@ -88,6 +88,8 @@ class Views:
                     yield "/object_surface", self._scene.object_surface
             case Probe():
                 yield from self._all_points(event.new_points)
+                if event.world_from_object is not None:
+                    yield "/object_pose", partial(object_in_world, event.world_from_object)
                 if len(event.gripper_path) > 0:
                     yield "/gripper_path", partial(poses_in_world, event.gripper_path)
             case HypothesesFound() if len(event.hypotheses.object_from_world) > 0:

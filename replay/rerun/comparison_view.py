@@ -85,7 +85,7 @@ class _Comparison:
         self, stream: rr.RecordingStream, recording: Recording, labels: Sequence[str]
     ) -> None:
         start = recording.start
-        self._stream, self._start = stream, start
+        self._stream, self._recording = stream, recording
         self._scene = Scene(stream)
         self._labels = list(labels)
         self._cost: CommonCost = common_cost(recording)
@@ -123,7 +123,8 @@ class _Comparison:
                 self._summarise(n, "no result")
                 continue
             self._meshes[n].draw(hypotheses, scale)
-            numbers = numbers_under(judge, hypotheses, self._start)
+            start = self._recording.start_at(problem.key.step)
+            numbers = numbers_under(judge, hypotheses, start)
             if has_pose(found[label]):
                 numbers["spread"] = trust_in(problem, found[label]).spread
             for which in ("best", "median"):

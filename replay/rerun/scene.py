@@ -70,6 +70,7 @@ class Scene:
             mins=[lower], sizes=[upper - lower], colors=[FRAME], radii=on_screen(0.6), fill_mode=1
         )
         self._stream.log("scene/workspace", box, static=True)
+        self._first_pose = world_from_object
         if world_from_object is not None:
             self.add_mesh("object", mesh, world_from_object, (*OBJECT, 255))
 
@@ -103,6 +104,9 @@ class Scene:
         """The gripper's path, what it met, and what became known, shown stronger for this probe."""
         path = probe.gripper_path
         self.add_points(probe.new_points)
+        if probe.world_from_object is not None and self._first_pose is not None:
+            since = inverse(self._first_pose) @ probe.world_from_object
+            self._stream.log("scene/object", mesh_poses(since[None]))
         self._points("free/new", probe.new_points.free, FREE, size=1.4)
         self._points("contacts/new", probe.contacts, CONTACT, size=7.0)
         self._points("gripper/end", path[-1:, :3, 3], GRIPPER, size=4.0)

@@ -53,8 +53,9 @@ def exported_hypotheses(recording: Recording, steps: str | None) -> Exported:
 
     npz: `steps` (S,), the steps that have some; `step_K/object_from_world` (B, 4, 4),
     `step_K/cost` (B,), `step_K/duplicate` (B,), `step_K/cell` (B,); `true_world_from_object`
-    (4, 4) where it is known. Table: a row a hypothesis; x, y, z (metres) and the unit quaternion
-    qx to qw are of world_from_object, rounded; m00 to m33 are object_from_world, exact.
+    (4, 4) where it is known, and `step_K/true_world_from_object` where pushes moved it. Table: a
+    row a hypothesis; x, y, z (metres) and the unit quaternion qx to qw are of world_from_object,
+    rounded; m00 to m33 are object_from_world, exact.
     """
     results = [step for step in recording.steps if recording.has_result(step)]
     chosen = _chosen(recording, steps, results, "result")
@@ -63,8 +64,10 @@ def exported_hypotheses(recording: Recording, steps: str | None) -> Exported:
         arrays["true_world_from_object"] = recording.start.world_from_object
     tables = []
     for step in chosen:
-        found = recording.hypotheses(step)
+        found, at_step = recording.hypotheses(step), recording.start_at(step)
         arrays |= {f"step_{step}/{name}": getattr(found, name) for name in _OF_HYPOTHESES}
+        if at_step is not recording.start:
+            arrays[f"step_{step}/true_world_from_object"] = at_step.world_from_object
         poses = inverse(found.object_from_world)
         columns = {
             "step": np.full(len(poses), step),

@@ -76,15 +76,16 @@ PROBES = _schema(
     (_FLAG, "hit"),
     (_NUMBER, "hit_forecast forecast_spread surprise seconds decision_seconds"),
     (_COUNT, "hypotheses poses"),
-    (_NUMBER, "error belief_error spread promised"),
-    (_TEXT, "stop digest problem_digest decision_digest"),
+    (_NUMBER, "error best_error belief_error spread promised"),
+    (_TEXT, "verdict stop digest problem_digest decision_digest"),
 )
 """A row a (configuration, seed, policy, probe). Lengths in metres, surprise in nats. probes: how
 many are done. action: index of the one that was taken, of those offered. hit: whether it met the
 object; hit_forecast, forecast_spread: the chance of it and the spread of the belief afterwards, as
 forecast. error: mean distance of the surface in a hypothesis from that in the true pose, of the
 last registration; before there is one, belief_error, the same of the belief's poses by their
-weights. poses: how many these are. spread: of the belief. promised: by how much the best action
+weights. best_error: the same of the best hypothesis. verdict: how far to trust the registration of
+this probe. poses: how many these are. spread: of the belief. promised: by how much the best action
 would narrow it. stop: why a session with the usual rules would end here, "" if it goes on."""
 TABLES = {"results": RESULTS, "iterations": ITERATIONS, "probes": PROBES}
 _ORDER = ("object", "configuration", "seed", "policy", "method", "step", "iteration")

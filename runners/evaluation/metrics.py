@@ -96,10 +96,15 @@ class HypothesisMetrics:
             row["rank"] = true_pose_rank(distance, chosen, self._truth)
         return row
 
-    def nearest(self, problem: RegistrationProblem, found: Hypotheses) -> tuple[int, float]:
-        """Index of the hypothesis nearest to the truth, and the RMS distance of surfaces, m."""
+    def nearest(
+        self, problem: RegistrationProblem, found: Hypotheses, truth: FloatArray
+    ) -> tuple[int, float]:
+        """Index of the hypothesis nearest to the truth (4, 4), RMS distance of their surfaces, m.
+
+        The truth is that of the problem's step, as pushes may move the object.
+        """
         distance = self._surface_distance(problem)
-        squares = distance.between(found.object_from_world, self._truth[None])[:, 0]  # (B,), mm^2
+        squares = distance.between(found.object_from_world, truth[None])[:, 0]  # (B,), mm^2
         nearest = int(np.argmin(squares))
         return nearest, 1e-3 * float(np.sqrt(squares[nearest]))
 

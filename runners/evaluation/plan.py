@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from chsel.errors import require_choice
+from chsel.errors import SettingError, require_choice
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.plausible.plausible_settings import PlausibleSettings
@@ -62,6 +62,10 @@ class Plan:
 
     def __post_init__(self) -> None:
         require_choice("session", self.kind, SESSIONS)
+        if self.plausible and self.session.get("moves"):
+            raise SettingError(
+                "plausible sets of an object that moves (session.moves); accepted: plausible=false"
+            )
 
     @property
     def kind(self) -> str:

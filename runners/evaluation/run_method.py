@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import ChselError
-from chsel.numerics.arrays import frozen, read_npz
+from chsel.numerics.arrays import FloatArray, frozen, read_npz
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import PlausibleSet, load_plausible
 from chsel.plausible.pose_metrics import pose_errors
@@ -58,7 +58,6 @@ class ResultRows:
 
         holds: of the method that made the hypotheses, tells whether its set has the truth.
         """
-        assert session.world_from_object is not None
         self._plan, self._trial = plan, trial
         self._about, self._holds = plan.about(trial, label), holds
         self._clean = trial.without_faults(plan)
@@ -70,9 +69,15 @@ class ResultRows:
         if plan.plausible:
             self._missing = read_told(self._clean.folder(plan))["no_plausible_set"]
         self._settings = plausible_settings_of(plan, session)
-        mesh, self._truth = session.recorded.mesh, session.world_from_object
+        mesh, self._session = session.recorded.mesh, session
         self._metrics = HypothesisMetrics(plan.metrics, mesh, self._truth)
         self._symmetry = object_symmetry(mesh)
+
+    @property
+    def _truth(self) -> FloatArray:
+        """The true pose (4, 4) at the step that the session has come to."""
+        assert self._session.world_from_object is not None
+        return self._session.world_from_object
 
     def members(self, problem: RegistrationProblem) -> tuple[PlausibleSet | None, str]:
         """The plausible set of a problem; else why there is none, "" where none is wanted."""
@@ -119,7 +124,7 @@ class ResultRows:
         if len(found.cost) == 0:
             return row
         of_session = self._of_session(problem)
-        nearest, distance = self._metrics.nearest(of_session, found)
+        nearest, distance = self._metrics.nearest(of_session, found, self._truth)
         chosen = found.object_from_world[[0, nearest]]
         position, rotation = pose_errors(chosen, self._truth, self._symmetry)
         row |= {

@@ -95,11 +95,13 @@ def _row(
     }
     found = online.previous
     if found is not None and len(found.cost) > 0:
-        row["error"] = float(errors(found.object_from_world).mean())
+        distances = errors(found.object_from_world)
+        row |= {"error": float(distances.mean()), "best_error": float(distances[0])}
     if session.registered is not None and session.problem is not None:
         hypotheses = session.registered.hypotheses
         row |= {
             "hypotheses": len(hypotheses.cost),
+            "verdict": numbers.get("verdict"),
             "digest": hypotheses.digest,
             "problem_digest": session.problem.digest,
             "seconds": session.registered.total_seconds,

@@ -112,7 +112,7 @@ def record_session(plan: Plan, trial: Trial, recorder: Recorder) -> None:
     try:
         for warning in scene.warnings:
             warnings.warn(warning, stacklevel=2)
-        events, truth = list(session.probes()), session.world_from_object
+        truth, events = session.world_from_object, list(session.probes())
         if log is not None:  # found with what is known at the end
             found = ProbedProblems(events, session, scene.sdf, trial.seed)
             at_end = found.problem(max(found.steps, default=0))

@@ -91,6 +91,7 @@ class Scene:
             seed=seed,
             points=self.session.initial_points,
             start=self.start,
+            push_distance=getattr(self.session, "push_distance", 0.0),
         )
 
 

@@ -121,7 +121,7 @@ class Faults:
     ) -> None:
         """mesh: the probed one, metres, at world_from_object (4, 4). free: of the session."""
         self._settings, self._mesh, self._seed = settings, mesh, seed
-        self._object_from_world = inverse(world_from_object)
+        self.object_from_world = inverse(world_from_object)  # changes where pushes move it
         self._free, self._workspace = free, workspace
         stream = StreamKey(seed, 0).stream(Purpose.FAULTS, _OF_SESSION)
         self._bias = settings.camera_bias * _directions(stream, 1)[0]  # (3,), world
@@ -191,14 +191,14 @@ class Faults:
 
     def _in_bounds(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
         """Which points (N, 3) are in the probed mesh's bounding box, padded by a margin, metres."""
-        in_object, (lower, upper) = apply(self._object_from_world, points), self._mesh.bounds
+        in_object, (lower, upper) = apply(self.object_from_world, points), self._mesh.bounds
         inside: BoolArray = (in_object >= lower - margin).all(axis=1)
         inside &= (in_object <= upper + margin).all(axis=1)
         return inside
 
     def _distance(self, points: FloatArray) -> FloatArray:
         """Signed distance (N,) of points (N, 3) in the world to the probed mesh, metres."""
-        return mesh_sdf(self._mesh, apply(self._object_from_world, points))[0]
+        return mesh_sdf(self._mesh, apply(self.object_from_world, points))[0]
 
     def _stream(self, step: int, index: int) -> np.random.Generator:
         return StreamKey(self._seed, step).stream(Purpose.FAULTS, index)

@@ -39,10 +39,13 @@ class Touch:
 
 
 class Engine(Protocol):
-    """A world with a fixed object and a gripper that starts at START."""
+    """A world with an object that resists every push, and a gripper that starts at START."""
 
     world_from_object: FloatArray
     """Pose (4, 4) of the mesh."""
+
+    def move(self, world_from_object: FloatArray) -> None:
+        """Put the object at a pose (4, 4); the hand should be away from it."""
 
     def advance(self, target: FloatArray) -> Touch:
         """Move the hand towards target (3,), a mini-step away, as far as it goes."""

@@ -1,4 +1,4 @@
-"""Probe sessions by geometry alone: the first contact of two rigid bodies, one of them fixed."""
+"""Probe sessions by geometry alone: the first contact of two rigid bodies."""
 
 from __future__ import annotations
 
@@ -30,15 +30,21 @@ class KinematicEngine:
         settings: ProbingSettings,
         hand: ProbingHand,
     ) -> None:
-        """mesh: metres, in its frame, fixed at world_from_object (4, 4)."""
-        self.world_from_object = world_from_object
-        self._object = _Surface(mesh, world_from_object)
+        """mesh: metres, in its frame, at world_from_object (4, 4) until it is moved."""
+        self._mesh = mesh
         self._patches = self._forward = _patches(hand)
         self._turn = np.eye(3)  # of the patches, from how a hand probes along x
         self._position = np.array(START)
         self._force = settings.max_force
         # No point of a patch is nearer to the object than this; kept true as the hand moves.
         self._clearance = np.zeros(len(self._patches.centres))
+        self.move(world_from_object)
+
+    def move(self, world_from_object: FloatArray) -> None:
+        """Put the object at a pose (4, 4)."""
+        self.world_from_object = world_from_object
+        self._object = _Surface(self._mesh, world_from_object)
+        self._clearance[:] = 0.0
 
     def advance(self, target: FloatArray) -> Touch:
         """Move to target (3,), or as far as the first contact on the straight way there."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,12 +19,13 @@ from chsel.next_probe.action_lattice import (
 from chsel.next_probe.decision_problem import Actions
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
-from chsel.problem.poses import apply, inverse
+from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.sdf_grid import mesh_sdf
+from chsel.problem.streams import Purpose, StreamKey, normals
 from runners.sessions.configurations import WORKSPACE, Configuration, find_configuration
 from runners.sessions.faults import Faults, FaultSettings, probed_mesh
 from runners.sessions.gripper import X_REST, Engine, Gripper
-from runners.sessions.placement import laid_down
+from runners.sessions.placement import centre_of_mass, laid_down
 from runners.sessions.probing_hand import (
     ROTATION,
     ProbingHand,
@@ -31,7 +33,7 @@ from runners.sessions.probing_hand import (
     turned_from_forward,
     world_from_gripper,
 )
-from runners.sessions.probing_settings import ProbingSettings
+from runners.sessions.probing_settings import ProbingSettings, expected_moves
 from runners.sessions.source import require_available
 
 if TYPE_CHECKING:
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 
 SLAB_MARGIN = 0.15  # m: by which the floor slab is wider than the object
 SLAB_LAYERS = 2
+_TURN = 0.7  # standard deviation: the turn of an object pushed, by its way in diameters
 
 
 def open_probing(
@@ -83,6 +86,7 @@ class ProbingSession:
         self.free_resolution = settings.free_resolution
         self.world_from_object: FloatArray | None = engine.world_from_object
         self.count = len(configuration.grid)
+        self.push_distance, self._seed = expected_moves(vars(settings)), seed
         self._voxels = FreeVoxels(Lattice(self.workspace.lower, settings.free_resolution))
         self.initial_points = KnownPoints(
             free=self._voxels.add(self._boundary(mesh, engine.world_from_object))
@@ -94,6 +98,7 @@ class ProbingSession:
                 f"the hand has no interior point {settings.interior_depth:g} m deep; accepted: a "
                 "smaller session.interior_depth, or a finer session.interior_spacing"
             )
+        self._centre, self._diameter = centre_of_mass(mesh), float(np.linalg.norm(mesh.extents))
         self._offered: Actions | None = None
         self._available = np.zeros(0, dtype=bool)
         self._engine, self._gripper = engine, Gripper(engine, settings, seed)
@@ -155,7 +160,7 @@ class ProbingSession:
         if self._faults is not None:
             free = np.concatenate([free, self._faults.wrongly_free(step, free)])
             contacts, normals = self._faults.reported(step, contacts, normals)
-        return Probe(
+        probe = Probe(
             step=step,
             outcome="contact" if len(contacts) else "free",
             new_points=KnownPoints(free=free, known=contacts),
@@ -163,6 +168,24 @@ class ProbingSession:
             contacts=contacts,
             contact_normals=normals,
         )
+        return probe if probe.push is None else self._pushed(probe, probe.push)
+
+    def _pushed(self, probe: Probe, direction: FloatArray) -> Probe:
+        """The same after the object has moved in a direction (3,), unless it stands."""
+        if self.push_distance > 0.0:
+            self._voxels.forget()  # what was free before has moved with the object
+        if self.settings.moves == 0.0:
+            return probe
+        stream = StreamKey(self._seed, probe.step).stream(Purpose.PUSHES)
+        angle = _TURN * self.settings.moves / self._diameter * float(normals(stream, 1)[0])
+        pose, turn = self._engine.world_from_object, axis_angle(np.eye(3)[2], angle)
+        pivot = apply(pose, self._centre[None])[0]
+        moved = pivot + self.settings.moves * direction + turn @ (pose[:3, 3] - pivot)
+        pose = self.world_from_object = compose(turn @ pose[:3, :3], moved)
+        self._engine.move(pose)
+        if self._faults is not None:
+            self._faults.object_from_world = inverse(pose)
+        return replace(probe, world_from_object=pose)
 
     def _boundary(self, mesh: trimesh.Trimesh, world_from_object: FloatArray) -> FloatArray:
         """Centres (N, 3) of the voxels where the object is known not to be."""

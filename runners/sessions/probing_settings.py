@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar
 from chsel.problem.settings import (
     CheckedSettings,
     Presets,
+    between,
     build_settings,
     not_negative,
     one_of,
@@ -20,6 +21,7 @@ from runners.sessions.probing_hand import DescribedHand
 Length = Annotated[float, positive]  # m
 Force = Annotated[float, positive]  # N
 Count = Annotated[int, not_negative]
+_STANDING = (("moves", 0.0), ("expect_moves", None))  # an object that stands still
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,11 @@ class ProbingSettings(CheckedSettings):
     faults: FaultSettings = field(default_factory=FaultSettings)
     """Of what is reported, and of the registered mesh."""
     hand: DescribedHand = field(default_factory=DescribedHand)  # with which is probed
+    # m: by which a push that touches the object then moves it. It turns about its centre, too: if
+    # it is 0.2 m long, by a standard deviation of 1 degree for 5 mm, and less if it is longer.
+    moves: Annotated[float, between(0.0, 0.1)] = 0.0
+    # m: what registration is told that a push moves the object at most; None: as `moves`.
+    expect_moves: Annotated[float, between(0.0, 0.1)] | None = None
 
     presets: ClassVar[Presets] = {
         "paper": {
@@ -63,9 +70,16 @@ class ProbingSettings(CheckedSettings):
     }
 
 
+def expected_moves(session: Mapping[str, Any]) -> float:
+    """What registration is told that a push moves the object at most, metres, by its settings."""
+    told = session.get("expect_moves")
+    return float(session.get("moves", 0.0) if told is None else told)
+
+
 def without_defaults(session: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a session as they are recorded: `faults` and `hand` only where there are any."""
+    """Settings of a session as they are recorded: some only where they are not the default."""
     defaults = {"faults": LEVELS[CLEAN], "hand": DescribedHand()}
+    session = {k: v for k, v in session.items() if (k, v) not in _STANDING}
     return {
         key: value
         for key, value in session.items()

@@ -22,7 +22,7 @@ from chsel.problem.settings import build_settings
 from chsel.sensing.free_space import interior_lattice, poses_between
 from replay.mcap.reader import read_recording
 from runners.sessions.probing_hand import DescribedHand, open_hand
-from runners.sessions.probing_settings import ProbingSettings
+from runners.sessions.probing_settings import ProbingSettings, expected_moves
 from runners.sessions.source import require_available
 
 _OF_GRIPPERS = ("simulated", "kinematic")  # sessions with a hand of ours
@@ -57,6 +57,7 @@ class RecordedSession:
         self.world_from_object, self.initial_points = start.world_from_object, start.initial_points
         self.count = len(self._probes)
         self._config: Mapping[str, Any] = start.config.get("session", {})
+        self.push_distance = expected_moves(self._config)
         chosen = {name: self._config.get(name) or 0 for name in ("start_contacts", "start_probe")}
         chosen |= {name: value for name, value in vars(settings).items() if value is not None}
         self.start = Start(chosen["start_contacts"], chosen["start_probe"])
@@ -69,7 +70,10 @@ class RecordedSession:
 
     def probes(self) -> Iterator[Probe]:
         """The recorded probes in their order."""
-        yield from self._probes
+        for probe in self._probes:
+            if probe.world_from_object is not None:
+                self.world_from_object = probe.world_from_object
+            yield probe
 
     @cached_property
     def hand(self) -> HandShape:
@@ -92,6 +96,11 @@ class RecordedSession:
 
     def offer(self, settings: ActionSettings) -> Actions:
         """The recorded probes, each as an action, whatever is chosen; see `Steerable`."""
+        if any(probe.world_from_object is not None for probe in self._probes):
+            raise SessionError(
+                f"recording {self._recording.path} has an object that moved, so that its probes "
+                "cannot be taken in another order; accepted: policy=grid"
+            )
         return self._actions.offer(settings)
 
     def available(self) -> BoolArray:
@@ -130,11 +139,12 @@ class RecordedSession:
             points=self.initial_points,
             start=self.start,
             only=only,
+            push_distance=self.push_distance,
         )
 
-    def perceived(self) -> Iterator[tuple[int, KnownPoints]]:
-        """The steps of the session with the points that are new in each."""
-        return ((probe.step, probe.new_points) for probe in self._probes)
+    def perceived(self) -> Iterator[tuple[int, KnownPoints, FloatArray | None]]:
+        """The steps of the session with the points that are new in each, and pushes."""
+        return ((probe.step, probe.new_points, probe.push) for probe in self.probes())
 
     def close(self) -> None:
         """Nothing is held open."""

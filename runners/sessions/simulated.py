@@ -106,6 +106,12 @@ class PyBulletEngine:
         near = world.getClosestPoints(self._hand, self._object, 0.0)
         return not any(record[_DISTANCE] < 0.0 for record in near)
 
+    def move(self, world_from_object: FloatArray) -> None:
+        """Put the object at a pose (4, 4)."""
+        self.world_from_object = world_from_object
+        position, quaternion = _placed(world_from_object).values()
+        self._world.resetBasePositionAndOrientation(self._object, position, quaternion)
+
     def close(self) -> None:
         """Disconnect from the engine."""
         if self._world.isConnected():

@@ -17,7 +17,7 @@ ProbeEvent = RigDescribed | SensorImage | Logged | Probe
 
 
 class ProbeSource(Protocol):
-    """A source of known points, probe by probe. The object does not move in a session."""
+    """A source of known points, probe by probe."""
 
     workspace: Workspace
     """Where the object can be."""
@@ -26,7 +26,7 @@ class ProbeSource(Protocol):
     """Side in metres of the voxels that free points are merged into."""
 
     world_from_object: FloatArray | None
-    """The true pose (4, 4) of the mesh frame, where known."""
+    """The true pose (4, 4) of the mesh frame, where known: after the last probe, if it moves."""
 
     initial_points: KnownPoints
     """What is known before the first probe."""

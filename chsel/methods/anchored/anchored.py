@@ -17,6 +17,7 @@ from chsel.problem.noise import NoiseModel, noise_model
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import Poses, compose, product, random_rotations, rotated
+from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import (
     Hypotheses,
     NullObserver,
@@ -59,6 +60,9 @@ _MOST_KNOWN = 64  # points that poses are rated by, as more of them tell hardly 
 _LEAST_LEFT = 3  # contacts that poses are sampled on if one is left out
 _TWINNED = 12  # basins whose poses are turned by near symmetries
 _MOST_GIVEN = 60  # of E_0 and E_l that are fitted
+_LEAST_PUSHES = 5  # of which a distance is estimated
+_HALVINGS = 2  # of the step between them, around the best
+_MOVED = 3.3  # nats: 99 % of a chi-squared distribution, half, of one more parameter
 
 
 MOST_SAMPLES = 1_000_000_000
@@ -164,6 +168,19 @@ class RatedPoses(NamedTuple):
         return self.chosen(np.argsort(self.energies, kind="stable"))
 
 
+class Standing(NamedTuple):
+    """What is found of an object if every push has moved it by one distance."""
+
+    distance: float  # metres
+    search: Search
+    minima: RatedPoses
+
+    @property
+    def lowest(self) -> float:
+        """The energy of the best pose, nats."""
+        return float(self.minima.energies[0])
+
+
 class Anchored(ConfiguredMethod[AnchoredSettings]):
     """Samples anchored on contacts, fitted, spread below a limit, and a diverse choice of them.
 
@@ -173,8 +190,40 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
     settings_class = AnchoredSettings
 
     def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
-        search = Search(problem, self.settings, observer)
-        return search.hypotheses(search.spread(search.minima()))
+        found = self._standing(problem, 0.0, observer)
+        if problem.pushes is not None and len(problem.pushes.directions) >= _LEAST_PUSHES:
+            moved = self._moved(problem, problem.pushes, observer)
+            if moved.lowest < found.lowest - _MOVED:
+                found = moved
+        hypotheses = found.search.hypotheses(found.search.spread(found.minima))
+        return replace(hypotheses, push_distance=found.distance)
+
+    def _standing(
+        self, problem: RegistrationProblem, distance: float, observer: Observer
+    ) -> Standing:
+        """The minima of an object that every push has moved by a distance, metres."""
+        search = Search(problem.carried(distance), self.settings, observer)
+        return Standing(distance, search, search.minima())
+
+    def _moved(self, problem: RegistrationProblem, pushes: Pushes, observer: Observer) -> Standing:
+        """The same for the distance above 0 of lowest energy.
+
+        The likelihood of the best pose has a maximum that a few searches find; between these, their
+        minima are fitted again.
+        """
+        _, step, *others = pushes.distances
+        tried = [self._standing(problem, distance, observer) for distance in (step, *others)]
+        best = min(tried, key=lambda s: s.lowest)
+        for _ in range(_HALVINGS):
+            step *= 0.5
+            near = [best]
+            for distance in (best.distance - step, best.distance + step):
+                if distance <= pushes.largest:
+                    search = Search(problem.carried(distance), self.settings, observer)
+                    fits = search.refined(search.rated(best.minima.poses))
+                    near.append(Standing(distance, search, fits))
+            best = min(near, key=lambda s: s.lowest)
+        return best
 
     def minima(self, problem: RegistrationProblem) -> Poses:
         """A pose of every basin that a search finds, the likeliest first."""
@@ -189,6 +238,7 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
         Those with an energy below the limit, beside the best hypothesis, where errors that points
         may share cost nothing.
         """
+        problem = problem.carried(hypotheses.push_distance)
         settings, search = self.settings, Search(problem, self.settings, NullObserver())
         energy = search.energy.by(noise_model(settings.noise, settings.shared_error))
         best = energy.of(Poses.of(hypotheses.object_from_world[:1]))
@@ -237,7 +287,7 @@ class Search:
             self._observer.progress("sample", effort.samples, effort.samples)
             starts = starts if index else Poses.joined([starts, given])
             rough = self.rated(fitted(far, self._twists, starts, effort.first_steps))
-            fits = self.refined(rough, effort.steps)
+            fits = self.refined(rough)
             self._show("fit", fits)
             last = self._descended(fits, effort.descents, effort.descent_moves, self._limit(found))
             before, found = found, RatedPoses.joined(found, last).ordered()
@@ -247,7 +297,7 @@ class Search:
             if spent >= effort.evaluations or (index and not self._new_modes(before, last)):
                 break
         polished = self._descended(found, effort.polished, effort.polish_moves, 0.0)
-        polished = self.refined(self._with_twins(polished), effort.steps)
+        polished = self.refined(self._with_twins(polished))
         self._show("descend", polished)
         return polished
 
@@ -260,7 +310,7 @@ class Search:
         turn, shift = symmetries[:, None, :3, :3], symmetries[:, None, :3, 3]
         turned = compose(product(turn, best.rotations), rotated(turn, best.translations) + shift)
         poses = self._in_space(Poses.of(turned.reshape(-1, 4, 4)))
-        twins = self.refined(self.rated(poses), self._effort.steps)
+        twins = self.refined(self.rated(poses))
         return RatedPoses.joined(rated, twins).ordered()
 
     def _in_space(self, poses: Poses) -> Poses:
@@ -274,10 +324,10 @@ class Search:
         given = Poses.of(np.concatenate([problem.initial_set, problem.low_cost_set]))
         return self.rated(self._in_space(given)).poses[:_MOST_GIVEN]
 
-    def refined(self, rated: RatedPoses, steps: int) -> RatedPoses:
+    def refined(self, rated: RatedPoses) -> RatedPoses:
         """The better part of them, the lowest first, fitted where that lowers their energies."""
         before = rated.chosen(slice(self._effort.refined))
-        poses = fitted(self.energy, self._twists, before.poses, steps)
+        poses = fitted(self.energy, self._twists, before.poses, self._effort.steps)
         after = RatedPoses(poses, self.energy.of(poses))
         lower = after.energies < before.energies
         others = rated.chosen(slice(self._effort.refined, None))
