@@ -19,7 +19,6 @@ import numpy as np
 
 from chsel.api import method_settings
 from chsel.errors import (
-    ChselError,
     InputWarning,
     PointsError,
     PoseError,
@@ -390,7 +389,7 @@ class Session:
             raise SettingError("a probe was chosen since; accepted: `register` before `next_probe`")
         try:
             return self.register_step()
-        except ChselError as error:
+        except Exception as error:
             self.failed(error)
             raise
         finally:
