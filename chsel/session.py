@@ -20,7 +20,6 @@ import numpy as np
 from chsel.api import method_settings
 from chsel.belief import Gripper, PoseBelief
 from chsel.errors import (
-    ChselError,
     InputWarning,
     PointsError,
     PoseError,
@@ -403,7 +402,7 @@ class Session:
             raise SettingError("a probe was chosen since; accepted: `register` before `next_probe`")
         try:
             return self.register_step()
-        except ChselError as error:
+        except Exception as error:
             self.failed(error)
             raise
         finally:

@@ -10,15 +10,13 @@ import trimesh
 import yaml
 
 from chsel.methods import OURS, preset_settings
-from chsel.next_probe.decision_problem import STOPS, Actions
-from chsel.next_probe.forecast import surprise
+from chsel.next_probe.decision_problem import STOPS
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.policies import OURS as POLICIES
 from chsel.policies.policy import PolicySettings
-from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.poses import compose
-from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.points import Workspace
 from chsel.problem.settings import in_preset, settings_mapping
+from examples.own_robot import FINGER, FakeRobot
 from runners.sessions.probing_settings import ProbingSettings
 from tests.chsel.samples import REPOSITORY
 
@@ -65,28 +63,17 @@ def test_every_policy_setting_and_reason_to_stop_is_there():
     assert set(settings) - set(shown) == {"actions.reach"}  # a group of its own, named above
 
 
-def test_the_program_of_the_next_probe_runs():
-    mesh = trimesh.creation.box(extents=(0.1, 0.1, 0.2))
-    starts = np.array([[x, 0.0, -0.4] for x in (-0.1, 0.0, 0.1)])
+def test_the_program_of_the_next_probe_stops_where_the_object_is_found():
+    mesh, truth = trimesh.creation.box(extents=(0.1, 0.12, 0.2)), np.eye(4)
+    truth[2, 3] = 0.1
     (program,) = re.findall(r"```python\n(.*?)```", NEXT_PROBE, re.DOTALL)
-    names = {
-        "grid": SdfGrid.from_mesh(mesh, 0.01),
-        "workspace": Workspace((-0.2,) * 3, (0.2,) * 3),
-        "actions": Actions(compose(np.tile(np.eye(3), (3, 1, 1)), starts), np.full(3, 0.6)),
-        "vertices": 0.3 * mesh.vertices,
-        "faces": mesh.faces,
-        "done": 0,
-        "points": KnownPoints(),
-        "hypotheses": None,
-        "available": np.array([True, True, False]),
-        "contacts": np.array([[0.0, 0.0, -0.1]]),
-    }
+    names = {"mesh": mesh, "gripper_mesh": FINGER, "robot": FakeRobot(mesh, truth)}
+    names["workspace"] = Workspace((-0.1, -0.1, 0.0), (0.1, 0.1, 0.2))
     exec(program, names)
-    decision = names["decision"]
-    assert decision.chosen == int(np.argmax(decision.score)) in (0, 1)
-    assert decision.score[2] == -np.inf
-    felt = surprise(names["problem"], decision, PolicySettings().noise, names["contacts"][0])
-    assert names["steering"].surprise == felt
+    session = names["session"]
+    assert session.stop in ("spread", "gain")
+    centre = np.linalg.inv(session.answer.object_from_world[0])[:3, 3]
+    np.testing.assert_allclose(centre, truth[:3, 3], atol=0.01)
 
 
 ORDER = ("paper", "reference", "default")
