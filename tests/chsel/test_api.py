@@ -213,10 +213,8 @@ def test_arrays_in_place_of_known_points_are_refused():
         chsel.Steering(*STEERED).decide(0, SURFACE, None, np.ones(1, dtype=bool))
 
 
-def test_the_examples_in_the_readme_run(tmp_path):
-    readme = (Path(__file__).parents[2] / "README.md").read_text()
-    starts = ("hand = chsel", "import chsel", "cost = chsel", r"method = chsel\.build_method")
-    starts += ("trust = hypotheses", "inside = chsel")
+def test_the_examples_of_the_library_run(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "session.md").read_text()
     BOX.export(tmp_path / "drill.obj")
     names = {
         "contacts": SURFACE,
@@ -226,24 +224,10 @@ def test_the_examples_in_the_readme_run(tmp_path):
         "rotation": torch.eye(3, dtype=torch.float64)[None].requires_grad_(),
         "translation": torch.full((1, 3), 0.01, dtype=torch.float64).requires_grad_(),
         "chsel": chsel,
-        "gripper_mesh": BOX,
-        "world_from_hand": compose(
-            np.array([DOWN, DOWN]), POSE[:3, 3] + [[0, 0, 0.2], [0.1, 0, 0.2]]
-        ),
-        "length": np.full(2, 0.3),
-        "hypotheses": None,
-        "available": np.ones(2, dtype=bool),
-        "done": 0,
-        "points": KNOWN,
-        "grid": chsel.SdfGrid.from_mesh(BOX, 0.002),
-        "workspace": chsel.Workspace((0.0, -0.2, 0.0), (0.6, 0.4, 0.4)),
-        "probes": [chsel.KnownPoints(known=part) for part in np.split(SURFACE, 2)],
     }
-    for start in starts:
-        (example,) = re.findall(rf"```python\n({start}.*?)```", readme, re.DOTALL)
+    for start in ("import chsel\n\nhypotheses", "trust = hypotheses", "cost = chsel"):
+        (example,) = re.findall(rf"```python\n({start}.*?)```", page, re.DOTALL)
         exec(example.replace('"drill.obj"', repr(str(tmp_path / "drill.obj"))), names)
     assert names["trust"].verdict == "determined"
     assert np.abs(inverse(names["best"])[:3, 3] - POSE[:3, 3]).max() < 0.005
-    assert names["online"].previous is names["step"].hypotheses
-    assert names["step"].problem.points.count == len(SURFACE)
     assert float(names["translation"].grad.abs().sum()) > 0.0
