@@ -19,6 +19,7 @@ from chsel.next_probe.decision_problem import HandShape
 from chsel.numerics.arrays import FloatArray, IntArray, evenly_spaced, frozen
 from chsel.numerics.elementary import arctangents
 from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry
+from chsel.problem.noise import LIMIT, noise_model
 from chsel.problem.poses import (
     Poses,
     apply,
@@ -32,12 +33,12 @@ from chsel.problem.poses import (
     rotation_angle,
     twice_sine_axis,
 )
-from chsel.problem.registration_problem import Hypotheses, Trust
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import CheckedSettings
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import outline_distances, signed_distances, surface_points
-from chsel.problem.trust import turned
+from chsel.problem.trust import SENSOR_NOISE, pose_energies, turned
 from chsel.sensing.free_space import interior_lattice
 
 if TYPE_CHECKING:
@@ -106,14 +107,25 @@ class PoseBelief:
         hypotheses: Hypotheses,
         symmetry: ObjectSymmetry | None = None,
         previous: PoseBelief | None = None,
+        *,
+        problem: RegistrationProblem | None = None,
+        noise: float = SENSOR_NOISE,
     ) -> None:
         """symmetry: of the object, for covariances. previous: whose numbers modes keep.
 
+        problem: whose points members have to explain, up to 9 nats above the lowest energy by the
+        sensor's noise, metres; methods that keep poses for diversity keep others, too.
         Raises PoseError for a result without trust, as it has no pose.
         """
         if hypotheses.trust is None:
             raise PoseError("the result has no trust; accepted: that of chsel.register")
         kept = ~hypotheses.duplicate & np.isfinite(hypotheses.object_from_world).all(axis=(1, 2))
+        if problem is not None:
+            at = np.flatnonzero(kept)
+            poses = Poses.of(hypotheses.object_from_world[at])
+            carried = problem.carried(hypotheses.push_distance)
+            energies = pose_energies(carried, poses, noise_model(noise))
+            kept[at[energies > energies.min(initial=np.inf) + LIMIT]] = False
         kept[list(hypotheses.trust.best_of_modes)] = True
         self.object_from_world: FloatArray = hypotheses.object_from_world[kept]
         self.trust: Trust = hypotheses.trust

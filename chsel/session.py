@@ -533,7 +533,14 @@ class Session:
             raise PoseError("nothing is registered yet; accepted: a belief after `register`")
         if self._belief is None or self._believed is not self.answer:
             symmetry = object_symmetry(self.started.mesh)
-            self._belief = PoseBelief(self.started.sdf, self.answer, symmetry, self._belief)
+            self._belief = PoseBelief(
+                self.started.sdf,
+                self.answer,
+                symmetry,
+                self._belief,
+                problem=self.problem if self.registered is not None else None,
+                noise=noise_of(self.method),
+            )
             self._believed = self.answer
             if self.registered is not None and not self._closed:
                 self._recorder.record(self._belief.event(self.step))

@@ -1,6 +1,7 @@
 """What a set of hypotheses means, by sets whose meaning is known."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ L_SHAPE = trimesh.boolean.union(
 )
 GRID, L_GRID = SdfGrid.from_mesh(BOX, 0.004), SdfGrid.from_mesh(L_SHAPE, 0.004)
 Z, STILL = np.array([0.0, 0.0, 1.0]), np.eye(4)
+NEITHER = np.zeros(2, dtype=bool)
 HALF_TURN = compose(axis_angle(Z, np.array(math.pi)), np.zeros(3))
 
 
@@ -155,8 +157,13 @@ def test_a_belief_that_is_asked_for_is_recorded_and_a_sure_grasp_ends_touching(t
     above = compose(np.diag([1.0, -1.0, -1.0]), np.array([-0.05, 0.0, 0.03]))
     with chsel.Session(L_SHAPE, record=tmp_path / "a.mcap", hand=hand) as session:
         session.add(contacts=contacts)
-        session.register()
+        found = session.register()
         (mode,) = session.belief.modes
+        off = shifted(np.array([[0.01, 0.0, 0.0]]), about=inverse(found.object_from_world[0]))
+        poses = np.concatenate([found.object_from_world[:1], inverse(off)])
+        two = replace(found, object_from_world=poses, cost=np.arange(2.0), duplicate=NEITHER)
+        assert len(PoseBelief(session.started.sdf, two)) == 2
+        assert len(PoseBelief(session.started.sdf, two, problem=session.problem)) == 1
         assert session.next_probe(grasps=(above[None], 0.07), sure=0.9) is None
         assert session.stop == "grasp"
     (told,) = [e for e in read_recording(tmp_path / "a.mcap").events() if isinstance(e, Believed)]
