@@ -11,6 +11,7 @@ from chsel.methods.anchor_sampling import (
     AnchoredStarts,
     AnchorSampler,
     AnchorSettings,
+    _sines_cosines,
     anchored_starts,
     most_informative_first,
 )
@@ -85,6 +86,12 @@ def test_the_best_are_the_first_of_all_and_do_not_depend_on_threads():
     np.testing.assert_array_equal(one, two)
     np.testing.assert_array_equal(one, every[:40])
     assert np.abs(drawn(points, AnchorSettings(), count, 40, index=1) - one).max() > 1e-3
+
+
+def test_sines_and_cosines_are_those_of_shares_of_a_turn():
+    shares = np.linspace(0.0, 1.0, 1000, endpoint=False, dtype=np.float32)
+    angles = 2.0 * np.pi * shares.astype(np.float64)
+    np.testing.assert_allclose(_sines_cosines(shares), [np.sin(angles), np.cos(angles)], atol=1e-6)
 
 
 def test_on_a_plane_poses_stand_on_it_and_still_meet_contacts():
