@@ -1,6 +1,7 @@
 """Whether hypotheses explain the known points, are alike, and are held by the points."""
 
 import math
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -25,11 +26,13 @@ from chsel.problem.trust import (
     LEAST_GAP,
     LEAST_LEVELS,
     MANY_CONTACTS,
+    MOST_LEVELS,
     MOST_MODES,
     MOST_NOISE,
     MOST_OFF,
     MOST_SYSTEMATIC,
     MOST_WIDTH,
+    _solved,
     can_be_moved,
     check_trust,
     correlation,
@@ -103,6 +106,8 @@ def test_numbers_are_those_of_the_points_at_the_best_hypothesis():
     assert trust.noise == pytest.approx(0.002, rel=0.15)
     assert trust.misfit == pytest.approx(math.sqrt(2.0 / math.pi) * 2.0, rel=0.15)
     assert trust.outliers < 0.01
+    for misfit, codes in ((MOST_LEVELS, []), (1.001 * MOST_LEVELS, ["above_noise"])):
+        assert [each.code for each in check_trust(replace(trust, misfit=misfit))] == codes
     one = judged(TURNED_BALL, NOISE, known=at_height(0.0005)[:1], free=CENTRE[None] + 0.9)
     assert one.misfit == pytest.approx(0.5, rel=0.03)
     assert trust.numbers["verdict"] == VERDICTS.index("determined") == 0
@@ -400,6 +405,13 @@ def test_the_correlation_is_of_errors_with_those_of_the_three_nearest():
     near = np.linalg.norm(points[:, None] - points, axis=-1).argsort(axis=1)[:, 1:4]
     expected = (errors[:, None] * errors[near]).sum() / (3.0 * (errors**2).sum())
     assert correlation(points, errors) == pytest.approx(expected)
+
+
+def test_equations_are_solved_as_by_lapack():
+    random = np.random.default_rng(3)
+    root, right = random.normal(size=(6, 6)), random.normal(size=(4, 6))
+    matrix = root @ root.T + np.eye(6)
+    np.testing.assert_allclose(_solved(matrix, right), np.linalg.solve(matrix, right.T).T)
 
 
 def test_a_box_beside_its_origin_is_as_symmetric():
