@@ -2,9 +2,10 @@
 
 ROOM: a folder or a file of the product. Cosmic Ray names every place where a number, an operator,
 a comparison or a condition can be changed, and the first two arguments of every call can be
-swapped. A random sample of these mutants is made in a copy of the tree, one at a time, and the
-tests of the room are run on each, golden digests and stored replays left out. Kernels are compiled
-again, as their code is kept by what is in the files.
+swapped. What cannot matter is left out: the order of arguments of max and min, and the flags repr
+and eq of dataclasses. A random sample of these mutants is made in a copy of the tree, one at a
+time, and the tests of the room are run on each, golden digests and stored replays left out.
+Kernels are compiled again, as their code is kept by what is in the files.
 """
 
 import argparse
@@ -60,17 +61,33 @@ def mutants_of(file):
     """Every mutant of a file: the file, what is changed, and at which of its places."""
     code = (ROOT / file).read_text()
     nodes = list(ast_nodes(get_ast(code)))
+    flags = {
+        (flag.value.lineno, flag.value.col_offset)
+        for call in calls(code, {"dataclass"})
+        for flag in call.keywords
+        if flag.arg in ("repr", "eq")
+    }
     for operator in OPERATORS:
         change = get_operator(f"core/{operator}")()
-        count = sum(len(list(change.mutation_positions(node))) for node in nodes)
-        yield from ((file, operator, occurrence) for occurrence in range(count))
+        places = [place for node in nodes for place, _ in change.mutation_positions(node)]
+        kept = [number for number, place in enumerate(places) if place not in flags]
+        yield from ((file, operator, occurrence) for occurrence in kept)
     yield from ((file, SWAPPED, occurrence) for occurrence in range(len(swappable(code))))
 
 
+def calls(code, names=None, but=()):
+    """The calls of the functions of those names, or of all but some."""
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Call):
+            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            if name not in but and (names is None or name in names):
+                yield node
+
+
 def swappable(code):
-    """The first two arguments of every call that has them."""
-    calls = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Call)]
-    pairs = [call.args[:2] for call in calls if len(call.args) > 1]
+    """The first two arguments of every call that has them and where their order may matter."""
+    alike = {"max", "min", "maximum", "minimum"}
+    pairs = [call.args[:2] for call in calls(code, but=alike) if len(call.args) > 1]
     return [pair for pair in pairs if not any(isinstance(each, ast.Starred) for each in pair)]
 
 
@@ -153,7 +170,8 @@ def main():
                 lines = difflib.unified_diff(
                     code.splitlines(), mutant.splitlines(), lineterm="", n=1
                 )
-                console.print(f"[red]not noticed[/]: {file}", *list(lines)[2:], sep="\n")
+                console.print(f"[red]not noticed[/]: {file}")
+                console.print(*list(lines)[2:], sep="\n", markup=False)
             console.print(f"{noticed} of {number} noticed", style="dim")
     share = 100.0 * noticed / len(chosen)
     console.print(f"{arguments.room}: {noticed} of {len(chosen)} of {len(mutants)}, {share:.0f} %")

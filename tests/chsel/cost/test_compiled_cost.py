@@ -20,6 +20,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.problem.poses import Poses, compose, random_rotations
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
+from chsel.problem.settings import in_preset
 from tests.chsel.samples import ball_grid, decode, random_poses
 
 pytestmark = pytest.mark.filterwarnings("ignore:free_term interior uses")
@@ -222,6 +223,7 @@ def test_by_default_alpha_is_a_quarter_of_a_free_voxel_or_half_of_the_greatest_d
     sdf = grid_of("sphere")  # 5 cm deep
     for resolution, alpha in ((0.02, -0.005), (0.4, -0.025)):
         assert CostSettings().of_object(sdf, resolution).alpha == pytest.approx(alpha)
+    assert [in_preset(CostSettings(), name).alpha for name in ("paper", "reference")] == [-0.01] * 2
 
 
 ON_LATTICE = ((np.argwhere(np.ones((59, 59, 59))) - 29) * 0.005)[:200_000]

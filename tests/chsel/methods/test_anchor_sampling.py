@@ -11,13 +11,14 @@ from chsel.methods.anchor_sampling import (
     AnchoredStarts,
     AnchorSampler,
     AnchorSettings,
+    _sines_cosines,
     anchored_starts,
     most_informative_first,
 )
 from chsel.methods.chsel import Chsel
 from chsel.numerics.threads import threads
 from chsel.problem.points import KnownPoints
-from chsel.problem.poses import apply, axis_angle, compose, inverse
+from chsel.problem.poses import Poses, apply, compose, inverse
 from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
 from chsel.problem.surface import has_surface
 from tests.chsel.methods.scene import BOX, BOX_GRID, WORKSPACE, Watcher, box_problem, contacts_on
@@ -87,15 +88,21 @@ def test_the_best_are_the_first_of_all_and_do_not_depend_on_threads():
     assert np.abs(drawn(points, AnchorSettings(), count, 40, index=1) - one).max() > 1e-3
 
 
-def test_on_a_plane_poses_stand_on_it_and_still_meet_contacts():
-    turn = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5))
-    standing = compose(turn, np.array([0.2, 0.1, 0.3]))
+def test_sines_and_cosines_are_those_of_shares_of_a_turn():
+    shares = np.linspace(0.0, 1.0, 1000, endpoint=False, dtype=np.float32)
+    angles = 2.0 * np.pi * shares.astype(np.float64)
+    np.testing.assert_allclose(_sines_cosines(shares), [np.sin(angles), np.cos(angles)], atol=1e-6)
+
+
+@pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (0.48, 0.6, 0.64)])
+def test_on_a_plane_poses_stand_on_it_and_still_meet_contacts(axis):
+    plane = PlaneSettings(axis=axis, offset=-0.3)
+    space = search_space(plane, BOX_GRID)
+    standing = inverse(space.poses(np.array([[0.5, 0.05, -0.1]])).matrices)[0]
     contact = apply(standing, np.array([[0.1, 0.02, 0.01]]))
-    plane = PlaneSettings(plane_height=0.26)
     poses = drawn(KnownPoints(known=contact), SINGLES, plane=plane)
     assert len(poses) > 300
-    np.testing.assert_allclose(poses[:, [2, 5, 6, 7]], 0.0, atol=1e-9)
-    np.testing.assert_allclose(poses[:, 11], poses[0, 11], atol=1e-9)
+    np.testing.assert_allclose(space.poses(space.encode(Poses(poses))).numbers, poses, atol=1e-9)
     assert np.abs(distances(poses, contact)).max() < 0.006
 
 

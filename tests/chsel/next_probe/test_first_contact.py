@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from chsel.next_probe.decision_problem import Actions, Belief
+from chsel.next_probe.decision_problem import CELL, Actions, Belief, HandShape
 from chsel.next_probe.first_contact import first_contacts, touched_points
 from chsel.problem.poses import apply, compose, inverse, random_rotations
 from chsel.problem.sdf_grid import SdfGrid
@@ -91,26 +91,54 @@ def by_definition(sdf, pose, world_from_hand, hand):
     seen = order[np.unique(cells[order], axis=0, return_index=True)[1]]  # the nearest of a cell
     best = seen[np.argsort(ways(points[seen]), kind="stable")[:3]]
     best = best[ways(points[best]) < np.inf]
+    if len(best) == 0:
+        return np.inf, np.zeros(3)
     fine = [surface.fine[surface.first[b] : surface.first[b + 1]] for b in best]
     near = np.concatenate([points[best], apply(hand_from_object, np.concatenate(fine))])
     least = int(np.argmin(ways(near)))
     return ways(near)[least], apply(world_from_hand, near[least : least + 1])[0]
 
 
-def test_first_contacts_are_those_of_the_definition():
+def bent_hand():
+    """Three faces whose corners are all at different heights, a little more than a centimetre."""
+    corners = np.random.default_rng(4).uniform((-0.006, -0.003, -0.03), (0.007, 0.005, 0.0), (6, 3))
+    return HandShape(corners, [[0, 1, 2], [5, 4, 3], [1, 3, 5]])
+
+
+def test_the_front_of_a_hand_is_its_highest_face_over_the_middle_of_a_cell():
+    hand, (heights, lower, cell) = bent_hand(), bent_hand().front
+    np.testing.assert_allclose(lower, hand.vertices[:, :2].min(axis=0) - CELL)
+    upper = lower + cell * np.array(heights.shape)
+    beyond = (upper - hand.vertices[:, :2].max(axis=0)) / CELL
+    assert cell == CELL
+    assert ((beyond >= 1.0) & (beyond < 2.0)).all()
+    expected = np.full(heights.shape, -np.inf)
+    for i, j in np.ndindex(heights.shape):
+        for corners in hand.vertices[hand.faces]:
+            x, y = lower + cell * (np.array([i, j]) + 0.5)
+            share = np.linalg.solve([*corners[:, :2].T, np.ones(3)], [x, y, 1.0])
+            if share.min() >= 0.0:
+                expected[i, j] = max(expected[i, j], share @ corners[:, 2])
+    for vertex in hand.vertices:
+        i, j = np.floor((vertex[:2] - lower) / cell).astype(int)
+        expected[i, j] = max(expected[i, j], vertex[2])
+    np.testing.assert_allclose(heights, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("hand", [box_hand(), bent_hand()])
+def test_first_contacts_are_those_of_the_definition(hand):
     stream, sdf = np.random.default_rng(8), SdfGrid.from_mesh(load_model("clamp"), 0.005)
     centre = sdf.bounds.mean(axis=0)
-    pose = inverse(compose(random_rotations(stream, 1)[0], np.zeros(3)))
+    pose = inverse(compose(random_rotations(stream, 1)[0], np.array([0.1, -0.2, 0.3])))
     middle = apply(inverse(pose), centre[None])[0]
-    turns = random_rotations(stream, 20)
-    beside = stream.uniform(-0.03, 0.03, (20, 2))
+    turns = random_rotations(stream, 60)
+    beside = stream.uniform(-0.03, 0.03, (60, 2))
     starts = middle + np.einsum("aij,aj->ai", turns[:, :, :2], beside) - 0.4 * turns[:, :, 2]
-    actions = Actions(compose(turns, starts), np.full(20, _WAY))
-    found = first_contacts(sdf, Belief(pose[None], np.ones(1)), actions, box_hand())
-    met = np.flatnonzero(np.isfinite(found.travel[0]))
-    assert len(met) >= 10
-    for n in met:
-        way, place = by_definition(sdf, pose, actions.world_from_hand[n], box_hand())
+    actions = Actions(compose(turns, starts), np.full(60, _WAY))
+    found = first_contacts(sdf, Belief(pose[None], np.ones(1)), actions, hand)
+    assert np.isfinite(found.travel).sum() >= 30
+    for n, world_from_hand in enumerate(actions.world_from_hand):
+        way, place = by_definition(sdf, pose, world_from_hand, hand)
         assert found.travel[0, n] == pytest.approx(way, abs=1e-12)
         np.testing.assert_allclose(found.contact[0, n], place, rtol=0, atol=1e-12)
 

@@ -1,4 +1,4 @@
-"""What actions are worth: formulas and closed forms; and what is refused."""
+"""Beliefs, surprises, what actions are worth, by formulas and closed forms; what is refused."""
 
 import math
 from dataclasses import replace
@@ -7,13 +7,28 @@ import numpy as np
 import pytest
 
 from chsel.errors import PoseError, SettingError
-from chsel.next_probe.decision_problem import (
-    Belief,
-    HandShape,
+from chsel.next_probe.decision_problem import Belief, HandShape
+from chsel.next_probe.forecast import (
+    BeliefSettings,
+    Forecast,
+    belief_after,
+    belief_before,
+    surprise,
 )
-from chsel.next_probe.forecast import Forecast
 from chsel.policies import POLICIES, build_policy
-from tests.chsel.next_probe.decisions import RADIUS, along_x, at, ball_problem, box_hand
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import Poses
+from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.streams import StreamKey
+from tests.chsel.next_probe.decisions import (
+    RADIUS,
+    WORKSPACE,
+    along_x,
+    at,
+    ball,
+    ball_problem,
+    box_hand,
+)
 
 NOISE = 0.005
 PLACES = [(0.0, 0.0), (0.06, 0.0), (-0.05, 0.03), (0.0, -0.1), (0.28, 0.28)]
@@ -25,6 +40,55 @@ def some_problem(seed, count, reach):
     poses = at(*stream.uniform(-reach, reach, (count, 3)).tolist())
     weights = stream.integers(0, 4, count) + 1e-3 * (np.arange(count) == 0)
     return ball_problem(poses, along_x(PLACES), weights=weights / weights.sum())
+
+
+def test_before_any_contact_the_object_stands_on_the_floor_outside_of_free_space():
+    grid = np.stack(np.meshgrid(*[np.arange(-0.3, 0.31, 0.02)] * 3), axis=-1).reshape(-1, 3)
+    left = KnownPoints(free=grid[grid[:, 0] < 0.1])
+    settings = BeliefSettings(poses=40, floor=-0.1)
+    belief = belief_before(ball(), left, WORKSPACE, StreamKey(3, 0), settings)
+    centres = Poses.of(belief.object_from_world).origins
+    np.testing.assert_allclose(centres[:, 2], RADIUS - 0.1, atol=0.004)
+    apart = np.sqrt(((centres[:, None] - left.free) ** 2).sum(axis=-1))
+    assert apart.min() > RADIUS - ball().resolution - 1e-4  # of all free points
+    anywhere = belief_before(
+        ball(), left, WORKSPACE, StreamKey(3, 0), replace(settings, floor=None)
+    )
+    assert np.ptp(Poses.of(anywhere.object_from_world).origins[:, 2]) > 0.3
+    assert belief.weights.sum() == pytest.approx(1.0)
+
+
+def test_after_a_registration_candidates_count_and_else_hypotheses():
+    poses = at(*((0.01 * n, 0.0, 0.0) for n in range(30)))
+    found = Hypotheses(
+        poses[:3], np.zeros(3), np.array([False, True, False]), np.zeros(3, np.int64), poses
+    )
+    np.testing.assert_array_equal(
+        belief_after(found, BeliefSettings()).object_from_world, poses[:3:2]
+    )
+    found = replace(found, candidates=poses)
+    belief = belief_after(found, BeliefSettings(poses=10))
+    np.testing.assert_array_equal(belief.object_from_world, poses[::3])
+    np.testing.assert_allclose(belief.weights, 0.1)
+
+
+def test_surprise_is_minus_the_logarithm_of_the_chance_of_what_happened():
+    """Two of three balls are met, at places apart in all axes."""
+    poses = at((0.0, 0.01, 0.0), (0.1, -0.01, 0.005), (0.0, 0.2, 0.2))
+    weights, nowhere = np.array([0.5, 0.3, 0.2]), np.full(3, 5.0)
+    problem = ball_problem(poses, along_x([(0.0, 0.0)]), weights=weights)
+    decision = build_policy("grid", {"stop": {"spread": 0.0, "gain": 0.0}}).decide(problem)
+    places, share = decision.contacts[:2], weights[:2] / 0.8
+    assert np.isnan(decision.contacts[2]).all()
+    scatter = share @ ((places - share @ places) ** 2).sum(axis=1)
+    for noise in (0.002, 0.03):
+        for contact in (places[0], places[1] + (0.01, 0.02, -0.03), nowhere):
+            squares = ((places - contact) ** 2).sum(axis=1)
+            near = np.maximum(np.exp(-squares / (4.0 * noise**2 + scatter)), 0.001)
+            expected = -np.log(0.95 * weights @ [*near, 0.001] + 0.05 * 0.01)
+            assert surprise(problem, decision, noise, contact) == pytest.approx(expected)
+        missed = -np.log(0.95 * weights @ [0.001, 0.001, 1.0] + 0.05 * 0.01)
+        assert surprise(problem, decision, noise, None) == pytest.approx(missed)
 
 
 def test_the_spread_is_the_root_mean_square_distance_of_surfaces():

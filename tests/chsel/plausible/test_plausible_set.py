@@ -27,6 +27,7 @@ from chsel.plausible.plausible_settings import (
     Offsets,
     PlausibleSettings,
     PoseGridSettings,
+    definition_name,
     plausible_settings,
 )
 from chsel.plausible.pose_scan import grid_around, scan_grid
@@ -225,8 +226,18 @@ def test_the_definitions_have_the_grids_that_their_sources_name():
     assert grid.positions.max(axis=0).tolist() == [0.3, 0.2, 0.1]
     np.testing.assert_allclose(rotation_angle(grid.rotations[100]), 0.0, atol=1e-9)
     np.testing.assert_allclose(grid.rotations[:100, 2], [[0.0, 0.0, 1.0]] * 100, atol=1e-15)
-    assert paper.cost.combine == "sums"
-    assert paper.cost.tolerance == 0.0
+    extents = grid_around(truth, default.grid, 5).positions[[0, -1]]
+    np.testing.assert_allclose(extents, [[-0.1, -0.2, 0.0], [0.15, 0.2, 0.1]], atol=1e-15)
+    for name, combine, tolerance in (
+        ("default", "means", 0.01),
+        ("paper", "sums", 0.0),
+        ("wide_means", "means", 0.0),
+        ("wide_means_10mm", "means", 0.01),
+        ("wide_sums", "sums", 0.0),
+    ):
+        settings = plausible_settings(name, 0.002)
+        assert (settings.cost.combine, settings.cost.tolerance) == (combine, tolerance)
+        assert definition_name(settings) == name
     problem, _ = touched_box()
     seeded = [replace(problem, key=StreamKey(seed, 0)) for seed in (5, 6)]
     assert len({rotation_seed(each, reference) for each in seeded}) == 1

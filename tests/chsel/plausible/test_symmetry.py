@@ -17,6 +17,7 @@ from chsel.plausible.plausible_settings import EvaluationCostSettings
 from chsel.plausible.pose_scan import PoseGrid, TruePoseSettings, find_true_pose
 from chsel.plausible.symmetry import (
     ObjectSymmetry,
+    RotatedSurface,
     generated,
     grid_symmetry,
     object_symmetry,
@@ -180,6 +181,14 @@ def test_a_sheet_without_a_thickness_turns_over():
     """Points that stay within its borders do not show small rotations in its plane."""
     square = trimesh.Trimesh([X * 0, X, X + Y, Y], [[0, 1, 2], [0, 2, 3]], process=False)
     assert_same_set(object_symmetry(square).rotations, dihedral(4), within=2e-3)
+
+
+def test_coarse_errors_are_mean_distances_in_diameters():
+    surface = RotatedSurface(trimesh.creation.box((0.2, 0.5, 1.0)))
+    turns = rotation_vector(np.random.default_rng(0).normal(size=(20, 3)))
+    expected = np.sqrt(surface._closest(turns, 128)[1]).mean(axis=1) / 2.0
+    assert expected.max() > 0.1
+    np.testing.assert_allclose(surface.coarse_errors(turns), expected, atol=0.015)
 
 
 def test_a_sphere_has_all_rotations():

@@ -7,6 +7,7 @@ import pytest
 
 from chsel.errors import SettingError
 from chsel.next_probe.decision_problem import Actions
+from chsel.next_probe.first_contact import touched_points
 from chsel.next_probe.forecast import Forecast
 from chsel.policies import POLICIES, build_policy
 from chsel.policies.voxel_entropy import filled_points, occupancy_entropy, voxel_box
@@ -17,6 +18,7 @@ from tests.chsel.next_probe.decisions import (
     WORKSPACE,
     along_x,
     at,
+    ball,
     ball_problem,
     facing,
 )
@@ -187,6 +189,26 @@ def test_the_entropy_swept_is_that_of_the_definition(known):
     expected = swept_by_definition(problem)
     assert (expected > 1.0).sum() >= 6
     assert rated == pytest.approx(expected, rel=1e-9)
+
+
+def test_voxels_hold_what_is_between_their_sides():
+    box = voxel_box(Workspace((0.0, -0.5, 1.0), (0.5, 0.25, 2.25)), 0.25)
+    assert (box.side, box.counts.tolist()) == (0.25, [2, 3, 5])
+    steps = np.stack(np.meshgrid(*[np.arange(-2.0, 12.0) / 2.0] * 3), axis=-1).reshape(-1, 3)
+    inside = ((steps >= 0.0) & (steps < (2, 3, 5))).all(axis=1)
+    held = box.holding(box.lower + 0.25 * steps)
+    np.testing.assert_array_equal(np.stack(held, axis=1), np.floor(steps[inside]))
+    for upper, side, counts in (((1, 1, 1), 0.01, [100] * 3), ((1, 1, 2), 1 / 64, [64, 64, 128])):
+        box = voxel_box(Workspace((0, 0, 0), upper), 0.01)
+        assert (box.side, box.counts.tolist()) == (pytest.approx(side), counts)
+
+
+def test_an_object_is_filled_at_nodes_half_a_voxel_apart():
+    sdf = ball()
+    nodes = np.argwhere(sdf.values <= 0.0)
+    nodes = nodes[(nodes % 2 == 0).all(axis=1)]
+    expected = [*touched_points(sdf).points, *(sdf.origin + nodes * sdf.resolution)]
+    np.testing.assert_allclose(filled_points(sdf, 4.5 * sdf.resolution), expected)
 
 
 def test_voxels_that_half_of_the_belief_fills_count_ln_2():

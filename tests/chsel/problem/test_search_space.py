@@ -6,9 +6,6 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
-from chsel import KnownPoints
-from chsel.cost.compiled_cost import CompiledCost
-from chsel.cost.objective import Objective
 from chsel.errors import PoseError, SettingError
 from chsel.plausible.surface_distance import SQUARE_MILLIMETRES, DistanceSettings, SurfaceDistance
 from chsel.problem.poses import (
@@ -30,7 +27,6 @@ from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.subset import farthest_points, representative_poses, surface_descriptors
 from chsel.problem.surface import surface_points
-from chsel.qd.measures import MEASURES, measure_named
 from tests.chsel.samples import decode, random_poses
 
 SIDES = (0.2, 0.1, 0.06)
@@ -102,67 +98,6 @@ def test_compiled_decoding_is_that_of_torch(space):
 def test_planes_that_say_too_little_or_too_much_are_refused(changes):
     with pytest.raises(SettingError):
         PlaneSettings(**changes)
-
-
-def measured(space):
-    """The space as measures take it."""
-    return Objective(CompiledCost(BOX, KnownPoints(known=[[0.0, 0.0, 0.0]])), space).space
-
-
-ON_PLANES = [name for name in MEASURES if name.startswith("plane")]
-CASES = [(name, TILTED if name in ON_PLANES else SE3Space()) for name in sorted(MEASURES)]
-CASES += [(name, TILTED) for name in ("position_3", "object_xy", "object_yaw")]
-
-
-@pytest.mark.parametrize(("name", "space"), CASES)
-def test_measures_have_the_gradients_of_their_values(name, space):
-    """Central differences, at vectors that are not orthonormal."""
-    measure = measure_named(name, planar=space is TILTED)
-    steps, given = 1e-6 * np.eye(space.dimension), measured(space)
-    for vector in np.random.default_rng(1).uniform(-1.0, 1.0, (5, space.dimension)):
-        rise = measure.values(given, vector + steps) - measure.values(given, vector - steps)
-        gradients = measure.gradients(given, vector)
-        assert gradients.shape == (measure.count, space.dimension)
-        np.testing.assert_allclose(gradients, rise.T / 2e-6, rtol=1e-6, atol=1e-7)
-        assert (np.abs(gradients).max(axis=1) > 0.01).all()
-
-
-def test_measures_of_vectors_and_translations_are_their_entries():
-    vectors, poses = STREAM.uniform(-1.0, 1.0, (10, 9)), STREAM.uniform(-1.0, 1.0, (10, 3))
-    expected = {f"rotation_{count}": vectors[:, :count] for count in range(1, 7)}
-    expected |= {f"position_{count}": vectors[:, 6 : 6 + count] for count in (2, 3)}
-    for name, values in expected.items():
-        np.testing.assert_array_equal(MEASURES[name].values(measured(SE3Space()), vectors), values)
-    expected = {"plane_position": poses[:, 1:], "plane_angle": poses[:, :1]}
-    expected["position_3"] = TILTED.poses(poses).matrices[:, :3, 3]
-    for name, values in expected.items():
-        np.testing.assert_array_equal(MEASURES[name].values(measured(TILTED), poses), values)
-
-
-def test_object_measures_are_of_world_from_object():
-    transforms = random_poses(STREAM, 10, 0.3)
-    world, vectors = inverse(transforms), SE3Space().encode(Poses.of(transforms))
-    xy, yaw = (
-        MEASURES[name].values(measured(SE3Space()), vectors) for name in ("object_xy", "object_yaw")
-    )
-    np.testing.assert_allclose(xy, world[:, :2, 3], atol=1e-14)
-    np.testing.assert_allclose(yaw[:, 0], np.arctan2(world[:, 1, 0], world[:, 0, 0]), atol=1e-12)
-
-
-def test_an_object_that_points_straight_up_has_a_yaw_and_no_gradient_of_it():
-    """The object's x axis along the world's z: the heading is not defined."""
-    rotation = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    vector = SE3Space().encode(Poses.of(compose(rotation[None], np.zeros((1, 3)))))
-    space, yaw = measured(SE3Space()), MEASURES["object_yaw"]
-    assert np.isfinite(yaw.values(space, vector)).all()
-    np.testing.assert_array_equal(yaw.gradients(space, vector[0]), np.zeros((1, 9)))
-
-
-def test_a_measure_of_the_other_space_names_those_that_fit():
-    with pytest.raises(SettingError, match="only with plane; accepted: object_xy"):
-        measure_named("plane_angle", planar=False)
-    with pytest.raises(SettingError, match=r"only without plane; accepted: .*plane_position"):
-        measure_named("rotation_3", planar=True)
 
 
 def test_transforms_that_are_not_rigid_are_named():

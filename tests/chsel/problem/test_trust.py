@@ -1,6 +1,7 @@
 """Whether hypotheses explain the known points, are alike, and are held by the points."""
 
 import math
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -10,7 +11,6 @@ import trimesh
 import chsel
 from chsel.errors import PoseError, SettingError
 from chsel.problem.noise import (
-    LEVELS,
     LIMIT,
     PRIOR_CONTACTS,
     PRIOR_OUTLIERS,
@@ -26,16 +26,20 @@ from chsel.problem.trust import (
     LEAST_GAP,
     LEAST_LEVELS,
     MANY_CONTACTS,
+    MOST_LEVELS,
     MOST_MODES,
     MOST_NOISE,
     MOST_OFF,
     MOST_SYSTEMATIC,
     MOST_WIDTH,
+    _solved,
     can_be_moved,
     check_trust,
+    correlation,
     has_pose,
     pose_energies,
     trust_in,
+    turned,
 )
 from tests.chsel.samples import hypotheses_at, plain_energies, plain_energy
 
@@ -102,6 +106,10 @@ def test_numbers_are_those_of_the_points_at_the_best_hypothesis():
     assert trust.noise == pytest.approx(0.002, rel=0.15)
     assert trust.misfit == pytest.approx(math.sqrt(2.0 / math.pi) * 2.0, rel=0.15)
     assert trust.outliers < 0.01
+    for misfit, codes in ((MOST_LEVELS, []), (1.001 * MOST_LEVELS, ["above_noise"])):
+        assert [each.code for each in check_trust(replace(trust, misfit=misfit))] == codes
+    one = judged(TURNED_BALL, NOISE, known=at_height(0.0005)[:1], free=CENTRE[None] + 0.9)
+    assert one.misfit == pytest.approx(0.5, rel=0.03)
     assert trust.numbers["verdict"] == VERDICTS.index("determined") == 0
 
 
@@ -391,6 +399,29 @@ def test_energies_of_poses_are_the_plain_formula(contacts):
     np.testing.assert_allclose(pose_energies(posed, poses, noise), expected, rtol=1e-9)
 
 
+def test_the_correlation_is_of_errors_with_those_of_the_three_nearest():
+    random = np.random.default_rng(2)
+    points, errors = random.uniform(-1.0, 1.0, (20, 3)) * (1.0, 2.0, 3.0), random.normal(size=20)
+    near = np.linalg.norm(points[:, None] - points, axis=-1).argsort(axis=1)[:, 1:4]
+    expected = (errors[:, None] * errors[near]).sum() / (3.0 * (errors**2).sum())
+    assert correlation(points, errors) == pytest.approx(expected)
+
+
+def test_equations_are_solved_as_by_lapack():
+    random = np.random.default_rng(3)
+    root, right = random.normal(size=(6, 6)), random.normal(size=(4, 6))
+    matrix = root @ root.T + np.eye(6)
+    np.testing.assert_allclose(_solved(matrix, right), np.linalg.solve(matrix, right.T).T)
+
+
+def test_a_box_beside_its_origin_is_as_symmetric():
+    sdf = chsel.SdfGrid.from_mesh(BOX.copy().apply_translation((0.05, -0.03, 0.02)), 0.004)
+    turns = axis_angle(np.array([0.0, 0.0, 1.0]), np.array([0.0, math.pi, 0.5 * math.pi]))
+    poses = Poses.of(compose(turns, np.array([CENTRE, -CENTRE, CENTRE])))
+    quarter = turned(sdf, poses, np.ones((3, 3), dtype=bool))
+    assert quarter.tolist() == [[False, False, True], [False, False, True], [True, True, False]]
+
+
 SENSOR = 0.0005
 
 
@@ -412,6 +443,11 @@ def test_distances_that_a_fit_makes_small_leave_the_noise_of_the_sensor(count):
     assert noise.outliers == pytest.approx(expected)
 
 
+def test_one_contact_counts_beside_those_of_the_sensor():
+    sigma = math.sqrt((PRIOR_CONTACTS * SENSOR**2 + 0.001**2) / PRIOR_CONTACTS)
+    assert estimate_noise([0.001], SENSOR).sigma == pytest.approx(sigma)
+
+
 def test_one_contact_far_off_among_five_is_an_outlier():
     distances = np.array([0.0003, -0.0004, 0.05, 0.0002, -0.0001])
     noise = estimate_noise(distances, SENSOR)
@@ -430,12 +466,9 @@ def test_energies_are_the_formula(known, shared):
     np.testing.assert_allclose(noise.energies(residuals, depths), expected, rtol=1e-12, atol=1e-12)
 
 
-def test_levels_of_noise_are_those_of_the_sensor_and_of_all_else():
-    one, other = noise_model(0.0), noise_model(0.003)
-    assert len(one.sigmas) == LEVELS
-    assert sum(one.weights) == pytest.approx(1.0)
-    squares = np.square(other.sigmas) - np.square(one.sigmas)
-    np.testing.assert_allclose(squares, 0.003**2)
-    ratios = np.diff(np.log(one.sigmas))
-    np.testing.assert_allclose(ratios, ratios[0])
-    assert one.sigmas[0] < 0.001 < 0.005 < one.sigmas[-1]
+@pytest.mark.parametrize("sensor", [0.0, 0.003])
+def test_levels_of_noise_are_those_of_the_sensor_and_of_all_else(sensor):
+    noise, errors = noise_model(sensor), np.geomspace(0.0006, 0.008, 8)
+    weights = np.exp(-0.5 * (np.log(errors / 0.002) / 0.6) ** 2)
+    np.testing.assert_allclose(noise.sigmas, np.sqrt(sensor**2 + errors**2))
+    np.testing.assert_allclose(noise.weights, weights / weights.sum())

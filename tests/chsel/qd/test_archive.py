@@ -1,4 +1,4 @@
-"""The archive, also against a plain loop."""
+"""The archive, also against a plain loop, and the measures of its cells."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from chsel.errors import ChselError
+from chsel.errors import ChselError, SettingError
+from chsel.problem.poses import Poses, compose, inverse
+from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space
 from chsel.qd.archive import GridArchive, rank, sampled_cell
-from chsel.qd.measures import MEASURES, VECTOR, Measure, MeasureCode
+from chsel.qd.measures import MEASURES, VECTOR, Measure, MeasureCode, measure_named
+from tests.chsel.samples import ball_grid, random_poses
 
 XY = Measure(("x", "y"), MeasureCode(VECTOR, 2))
 
@@ -172,3 +175,59 @@ def test_ranking_is_by_status_then_value_then_the_later(pairs):
     improved = ranked(status, value, order)
     np.testing.assert_array_equal(order, np.lexsort((value, status))[::-1])
     assert improved == (status > 0).sum()
+
+
+TILTED = SE2Space(PlaneSettings(axis=(0.0, 0.6, 0.8), offset=0.1), ball_grid(0.05, 0.02, 5))
+ON_PLANES = [name for name in MEASURES if name.startswith("plane")]
+CASES = [(name, TILTED if name in ON_PLANES else SE3Space()) for name in sorted(MEASURES)]
+CASES += [(name, TILTED) for name in ("position_3", "object_xy", "object_yaw")]
+
+
+@pytest.mark.parametrize(("name", "space"), CASES)
+def test_measures_have_the_gradients_of_their_values(name, space):
+    """Central differences, at vectors that are not orthonormal."""
+    measure = measure_named(name, planar=space is TILTED)
+    assert measure.code.size == measure.count
+    steps = 1e-6 * np.eye(space.dimension)
+    for vector in np.random.default_rng(1).uniform(-1.0, 1.0, (5, space.dimension)):
+        rise = measure.values(space, vector + steps) - measure.values(space, vector - steps)
+        gradients = measure.gradients(space, vector)
+        assert gradients.shape == (measure.count, space.dimension)
+        np.testing.assert_allclose(gradients, rise.T / 2e-6, rtol=1e-6, atol=1e-7)
+        assert (np.abs(gradients).max(axis=1) > 0.01).all()
+
+
+def test_measures_of_vectors_and_translations_are_their_entries():
+    vectors, poses = (np.random.default_rng(2).uniform(-1.0, 1.0, (10, d)) for d in (9, 3))
+    expected = {f"rotation_{count}": vectors[:, :count] for count in range(1, 7)}
+    expected |= {f"position_{count}": vectors[:, 6 : 6 + count] for count in (2, 3)}
+    for name, values in expected.items():
+        np.testing.assert_array_equal(MEASURES[name].values(SE3Space(), vectors), values)
+    expected = {"plane_position": poses[:, 1:], "plane_angle": poses[:, :1]}
+    expected["position_3"] = TILTED.poses(poses).matrices[:, :3, 3]
+    for name, values in expected.items():
+        np.testing.assert_array_equal(MEASURES[name].values(TILTED, poses), values)
+
+
+def test_object_measures_are_of_world_from_object():
+    transforms = random_poses(np.random.default_rng(3), 10, 0.3)
+    world, vectors = inverse(transforms), SE3Space().encode(Poses.of(transforms))
+    xy, yaw = (MEASURES[name].values(SE3Space(), vectors) for name in ("object_xy", "object_yaw"))
+    np.testing.assert_allclose(xy, world[:, :2, 3], atol=1e-14)
+    np.testing.assert_allclose(yaw[:, 0], np.arctan2(world[:, 1, 0], world[:, 0, 0]), atol=1e-12)
+
+
+def test_an_object_that_points_straight_up_has_a_yaw_and_no_gradient_of_it():
+    """The object's x axis along the world's z: the heading is not defined."""
+    rotation = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    vector = SE3Space().encode(Poses.of(compose(rotation[None], np.zeros((1, 3)))))
+    space, yaw = SE3Space(), MEASURES["object_yaw"]
+    assert np.isfinite(yaw.values(space, vector)).all()
+    np.testing.assert_array_equal(yaw.gradients(space, vector[0]), np.zeros((1, 9)))
+
+
+def test_a_measure_of_the_other_space_names_those_that_fit():
+    with pytest.raises(SettingError, match="only with plane; accepted: object_xy"):
+        measure_named("plane_angle", planar=False)
+    with pytest.raises(SettingError, match=r"only without plane; accepted: .*plane_position"):
+        measure_named("rotation_3", planar=True)

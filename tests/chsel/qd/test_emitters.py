@@ -87,6 +87,8 @@ def found(name, kind, interval=0):
     objective: Any = LandscapeObjective(kind)
     observer = Watcher(snapshot_interval=interval)
     fill_archive(name, objective, archive, START, COUNT, SETTINGS, StreamKey(4, 0), observer)
+    shown = [*range(0, ITERATIONS, interval or ITERATIONS), ITERATIONS]
+    assert [snapshot.iteration for snapshot in observer.archives] == shown
     return archive
 
 

@@ -115,12 +115,15 @@ def test_samples_are_those_of_cma_es_with_matrices(n, batch, parity):
     assert theirs.decomposed_at > 0
 
 
-@pytest.mark.parametrize(("squared_step", "steady"), [(7.0, True), (8.9, True), (9.1, False)])
-def test_path_c_waits_while_path_s_is_too_long(squared_step, steady):
-    # For n = 3, one parent, sigma = 1: |p_s|^2 / n / (1 - (1 - c_s)^2) = |y|^2 / 3, below 3.
+@pytest.mark.parametrize("told", [0, 2, 4])
+@pytest.mark.parametrize(("share", "steady"), [(0.7, True), (0.99, True), (1.01, False)])
+def test_path_c_waits_while_path_s_is_too_long(told, share, steady):
+    # For n = 3, one parent, sigma = 1, c_s = 1 / 3: |p_s|^2 / n = |y|^2 5 / 27, and steady where
+    # it is below 3 (1 - (1 - c_s)^(2 t)), t batches told.
     strategy = strategy_around(np.zeros(3), 5, 1.0)
+    strategy.evaluations[0] = 5 * told
     samples = np.zeros((5, 3))
-    samples[2, 1] = np.sqrt(squared_step)
+    samples[2, 1] = np.sqrt(share * 16.2 * (1.0 - (2.0 / 3.0) ** (2 * told + 2)))
     tell(strategy, samples, np.array([2, 0, 1, 3, 4]), 1)
     assert (strategy.path_c[1] > 0.0) == steady
 

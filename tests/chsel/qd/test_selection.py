@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -8,13 +9,15 @@ import pytest
 
 from chsel import KnownPoints, RegistrationProblem, Workspace
 from chsel.problem.poses import Poses, compose, inverse
-from chsel.problem.search_space import search_space
+from chsel.problem.search_space import SE3Space, search_space
 from chsel.problem.streams import StreamKey
 from chsel.qd.archive import Evaluated
 from chsel.qd.measures import MEASURES
 from chsel.qd.selection import (
     ArchiveSettings,
     OutputSettings,
+    ranked,
+    ranked_hypotheses,
     repeated,
     select_elites,
     sized_archive,
@@ -114,6 +117,17 @@ def test_repetitions_are_flagged_after_the_first():
     poses = np.stack([np.eye(4), 2 * np.eye(4), np.eye(4), 2 * np.eye(4), 3 * np.eye(4)])
     assert repeated(Poses.of(poses)).tolist() == [False, False, True, True, False]
     assert repeated(Poses.of(poses[:0])).tolist() == []
+
+
+def test_hypotheses_come_in_the_order_of_their_costs():
+    poses, order = at(np.array([0.3, 0.1, 0.3, 0.2])), [1, 3, 0, 2]
+    along_x: Any = SimpleNamespace(space=SE3Space(), costs=lambda vectors: -vectors[:, 6])
+    found = ranked_hypotheses(along_x, Poses.of(poses))
+    np.testing.assert_allclose(found.object_from_world, poses[order])
+    np.testing.assert_allclose(found.cost, [0.1, 0.2, 0.3, 0.3])
+    assert found.duplicate.tolist() == [False, False, False, True]
+    assert found.cell.tolist() == [-1] * 4
+    assert ranked(poses, -poses[:, 0, 3], np.arange(4)).cell.tolist() == order
 
 
 GROUPS = np.array([0.1, 0.101, 0.102, 0.103, 0.5, 0.501, 0.502, 0.503, 0.9, 0.901, 0.902, 0.903])
