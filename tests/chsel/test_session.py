@@ -153,6 +153,7 @@ def test_a_depth_image_and_two_touches_give_the_pose():
     seen, free = (apply(inverse(TRUTH), each) for each in (points.contacts, points.free))
     assert np.sum(np.abs(box_distance(seen, SIDES)) < 1e-9) == len(seen) > 20
     assert np.sum(box_distance(free, SIDES) > 0.0) == len(free) > 500
+    assert cKDTree(seen).query(free)[0].min() > 0.5 * 0.01 * 3.0**0.5  # half a voxel's diagonal
     for place in ([[0.06, 0.01, 0.05]], [[0.02, 0.04, -0.03]]):  # on sides that it does not see
         session.add(contacts=apply(TRUTH, np.array(place)))
     found = inverse(session.register().object_from_world[0])
