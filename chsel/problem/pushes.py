@@ -38,6 +38,7 @@ class Pushes(ShapesShown):
             raise PointsError("points before pushes decrease; accepted: counts (P, 3) in time")
         object.__setattr__(self, "directions", directions)
         object.__setattr__(self, "before", before)
+        object.__setattr__(self, "largest", float(self.largest))
 
     def require_points(self, points: KnownPoints) -> None:
         """Raise PointsError if more points were known before a push than there are."""

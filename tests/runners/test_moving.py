@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from chsel.events import Measured
+from chsel.events import Measured, Probe
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, inverse, rotation_angle
 from chsel.problem.sdf_grid import mesh_sdf
 from replay.comparing.verification import EQUAL, verify
@@ -80,6 +81,23 @@ def test_recorded_problems_with_pushes_give_the_recorded_bits(recording):
     np.testing.assert_array_equal(
         session.world_from_object, recording.start_at(recording.steps[-1]).world_from_object
     )
+
+
+@pytest.mark.parametrize(
+    ("way", "outcome", "push"),
+    [
+        ([0.48, 0.64, -0.6], "contact", [0.6, 0.8, 0.0]),
+        ([0.48, 0.64, -0.6], "free", None),
+        ([0.0, 0.0, -1.0], "contact", None),
+    ],
+)
+def test_a_push_is_horizontal_along_the_z_axis_of_a_hand_that_touches(way, outcome, push):
+    path = np.eye(4)[None].repeat(2, axis=0)
+    path[1, :3, 2] = way  # the other axes do not matter
+    found = Probe(0, outcome, KnownPoints(), path).push
+    assert (found is None) == (push is None)
+    if push is not None:
+        np.testing.assert_allclose(found, push)
 
 
 def test_there_are_no_plausible_sets_of_an_object_that_moves(tmp_path):

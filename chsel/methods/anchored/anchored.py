@@ -168,7 +168,7 @@ class RatedPoses(NamedTuple):
         return self.chosen(np.argsort(self.energies, kind="stable"))
 
 
-class Standing(NamedTuple):
+class Carried(NamedTuple):
     """What is found of an object if every push has moved it by one distance."""
 
     distance: float  # metres
@@ -190,7 +190,7 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
     settings_class = AnchoredSettings
 
     def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
-        found = self._standing(problem, 0.0, observer)
+        found = self._carried(problem, 0.0, observer)
         if problem.pushes is not None and len(problem.pushes.directions) >= _LEAST_PUSHES:
             moved = self._moved(problem, problem.pushes, observer)
             if moved.lowest < found.lowest - _MOVED:
@@ -198,21 +198,21 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
         hypotheses = found.search.hypotheses(found.search.spread(found.minima))
         return replace(hypotheses, push_distance=found.distance)
 
-    def _standing(
+    def _carried(
         self, problem: RegistrationProblem, distance: float, observer: Observer
-    ) -> Standing:
+    ) -> Carried:
         """The minima of an object that every push has moved by a distance, metres."""
         search = Search(problem.carried(distance), self.settings, observer)
-        return Standing(distance, search, search.minima())
+        return Carried(distance, search, search.minima())
 
-    def _moved(self, problem: RegistrationProblem, pushes: Pushes, observer: Observer) -> Standing:
+    def _moved(self, problem: RegistrationProblem, pushes: Pushes, observer: Observer) -> Carried:
         """The same for the distance above 0 of lowest energy.
 
         The likelihood of the best pose has a maximum that a few searches find; between these, their
         minima are fitted again.
         """
         _, step, *others = pushes.distances
-        tried = [self._standing(problem, distance, observer) for distance in (step, *others)]
+        tried = [self._carried(problem, distance, observer) for distance in (step, *others)]
         best = min(tried, key=lambda s: s.lowest)
         for _ in range(_HALVINGS):
             step *= 0.5
@@ -221,7 +221,7 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
                 if distance <= pushes.largest:
                     search = Search(problem.carried(distance), self.settings, observer)
                     fits = search.refined(search.rated(best.minima.poses))
-                    near.append(Standing(distance, search, fits))
+                    near.append(Carried(distance, search, fits))
             best = min(near, key=lambda s: s.lowest)
         return best
 

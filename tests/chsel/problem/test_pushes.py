@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import chsel
 from chsel import KnownPoints, OnlineRegistration, Pushes, trust_in
 from chsel.errors import PointsError, SettingError
 from chsel.methods import trust_by
@@ -105,6 +106,13 @@ def test_an_object_that_stands_has_the_same_result_as_if_nobody_spoke_of_pushes(
     assert found.digest == method.register(replace(told, pushes=None)).digest
     assert found.push_distance == 0.0
     assert told.digest != replace(told, pushes=None).digest
+
+
+def test_something_else_than_pushes_is_an_error():
+    with pytest.raises(
+        SettingError, match=r"accepted: chsel.Pushes\(directions, before, largest\)"
+    ):
+        chsel.register(GRID, surface=[X], pushes=[X])
 
 
 def test_pushes_count_where_the_object_may_move():
