@@ -85,6 +85,12 @@ def test_ratios_are_by_session_with_wins_and_an_interval(tmp_path, rows):
     assert (back["wins"], back["losses"]) == (of["losses"], of["wins"])
 
 
+def test_equal_errors_are_neither_wins_nor_losses(tmp_path):
+    rows = [row for name in BUDGETS for row in session("can", 20, name, [80.0, 8.0, 4.0, 2.0])]
+    of = paired(sessions_of(tmp_path, rows), "grid")
+    assert [of[name] for name in ("wins", "losses", "sign_test")] == [0, 0, 1.0]
+
+
 def test_the_interval_of_a_mean_is_that_of_independent_configurations():
     values = np.random.default_rng(0).normal(2.0, 1.0, 200)
     index = pd.MultiIndex.from_product([range(200), [0, 1, 2]], names=["configuration", "seed"])

@@ -94,16 +94,18 @@ def test_sines_and_cosines_are_those_of_shares_of_a_turn():
     np.testing.assert_allclose(_sines_cosines(shares), [np.sin(angles), np.cos(angles)], atol=1e-6)
 
 
-@pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (0.48, 0.6, 0.64)])
-def test_on_a_plane_poses_stand_on_it_and_still_meet_contacts(axis):
+@pytest.mark.parametrize(("axis", "value"), [((0.0, 0.0, 1.0), 0.02), ((0.48, 0.6, 0.64), 0.0)])
+def test_on_a_plane_poses_stand_on_it_and_still_meet_contacts(axis, value):
     plane = PlaneSettings(axis=axis, offset=-0.3)
     space = search_space(plane, BOX_GRID)
     standing = inverse(space.poses(np.array([[0.5, 0.05, -0.1]])).matrices)[0]
-    contact = apply(standing, np.array([[0.1, 0.02, 0.01]]))
-    poses = drawn(KnownPoints(known=contact), SINGLES, plane=plane)
+    contact = apply(standing, np.array([[0.1 + value, 0.02, 0.01]]))
+    points = KnownPoints(known=contact, known_sdf=[value])
+    poses = drawn(points, SINGLES, plane=plane)
     assert len(poses) > 300
     np.testing.assert_allclose(space.poses(space.encode(Poses(poses))).numbers, poses, atol=1e-9)
-    assert np.abs(distances(poses, contact)).max() < 0.006
+    off = np.abs(distances(poses, contact) - value)
+    assert np.quantile(off, 0.8 if value else 1.0) < 0.006
 
 
 def test_known_points_come_far_apart_first_and_none_is_lost():

@@ -131,12 +131,12 @@ def test_first_contacts_are_those_of_the_definition(hand):
     centre = sdf.bounds.mean(axis=0)
     pose = inverse(compose(random_rotations(stream, 1)[0], np.array([0.1, -0.2, 0.3])))
     middle = apply(inverse(pose), centre[None])[0]
-    turns = random_rotations(stream, 60)
-    beside = stream.uniform(-0.03, 0.03, (60, 2))
+    turns = random_rotations(stream, 200)
+    beside = stream.uniform(-0.03, 0.03, (200, 2))
     starts = middle + np.einsum("aij,aj->ai", turns[:, :, :2], beside) - 0.4 * turns[:, :, 2]
-    actions = Actions(compose(turns, starts), np.full(60, _WAY))
+    actions = Actions(compose(turns, starts), np.full(200, _WAY))
     found = first_contacts(sdf, Belief(pose[None], np.ones(1)), actions, hand)
-    assert np.isfinite(found.travel).sum() >= 30
+    assert np.isfinite(found.travel).sum() >= 100
     for n, world_from_hand in enumerate(actions.world_from_hand):
         way, place = by_definition(sdf, pose, world_from_hand, hand)
         assert found.travel[0, n] == pytest.approx(way, abs=1e-12)

@@ -27,7 +27,6 @@ from tests.chsel.next_probe.decisions import (
     at,
     ball,
     ball_problem,
-    box_hand,
 )
 
 NOISE = 0.005
@@ -160,11 +159,3 @@ def test_what_is_no_problem_is_refused(make, error, message):
         make()
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_a_hand_of_one_flat_face_still_touches():
-    sheet = HandShape([[-0.02, -0.01, 0.0], [0.02, -0.01, 0.0], [0.0, 0.02, 0.0]], [[0, 1, 2]])
-    problem = replace(some_problem(1, 5, 0.01), hand=sheet)
-    assert np.isfinite(Forecast(problem, NOISE).first.travel[:, 0]).all()
-    assert (sheet.front.heights > -np.inf).any()
-    assert box_hand().front.heights.max() == 0.0
