@@ -146,7 +146,7 @@ def test_a_mistake_is_one_line(server):
         ("/add", {"contacts": [[1, 2]]}, "contacts has shape (1, 2); accepted: (any, 3)"),
         ("/add", {"free": "x"}, "free is not an array of numbers; accepted: nested lists"),
         ("/add", {"free": packed([3, 3])}, "free is not an array of numbers; accepted"),
-        ("/add", {"contact": [0, 0, None]}, "contact[0] is not finite"),
+        ("/add", {"contact": [0, 0, None]}, "contact[2] is not finite"),
         ("/add", {"contcts": []}, "a name in add is 'contcts'; accepted: contacts, free"),
         ("/register", {}, "nothing is known yet; accepted: a registration after `add`"),
         ("/next_probe", {"length": [1]}, "actions are incomplete; accepted:"),

@@ -173,9 +173,9 @@ def test_every_object_has_its_configurations_and_these_their_numbers_of_probes()
         assert found.grid[: len(found.z) + 1] == [*first, (found.y[1], found.z[0])]
 
 
-def test_the_placements_that_differ_from_the_experiments_are_named_in_the_readme():
-    readme = (Path(__file__).resolve().parents[3] / "README.md").read_text()
-    passage = readme.partition("**Simulated sessions.**")[2].partition("**Scans.**")[0]
+def test_the_placements_that_differ_from_the_experiments_are_named_on_their_page():
+    page = (Path(__file__).resolve().parents[3] / "docs" / "probing.md").read_text()
+    passage = page.partition("**Simulated sessions.**")[2].partition("**Scans.**")[0]
     assert set(re.findall(r"`([a-z_]+)`", passage)) & set(CONFIGURATIONS) == set(THEIRS)
     assert all(CONFIGURATIONS[name].position != there for name, there in THEIRS.items())
 
