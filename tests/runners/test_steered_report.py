@@ -28,7 +28,7 @@ def sessions_of(folder, rows, reference=None):
 @pytest.fixture
 def rows():
     """Three trials of two policies."""
-    forecasts = {"hit_forecast": [0.95, 0.85, 0.15, 0.85], "hit": [True, True, False, False]}
+    forecasts = {"hit_forecast": [1.0, 0.85, 0.15, 0.85], "hit": [True, True, False, False]}
     return [
         *session("can", 20, "information", [80.0, 8.0, 4.0, 2.0], **forecasts),
         *session("can", 20, "grid", [80.0, 40.0, 20.0, 10.0]),
@@ -120,16 +120,16 @@ def test_tables_have_the_numbers_of_the_sessions(tmp_path, rows):
     ]
     hits = tables["Chance of a hit, forecast and happened, %"]
     assert hits[1:] == [
-        ["information", "4", "70.0", "50.0", "+20.0"],
-        ["all, before the first contact", "2", "90.0", "100.0", "-10.0"],
+        ["information", "4", "71.2", "50.0", "+21.2"],
+        ["all, before the first contact", "2", "92.5", "100.0", "-7.5"],
         ["all, after it", "2", "50.0", "0.0", "+50.0"],
-        ["all", "4", "70.0", "50.0", "+20.0"],
+        ["all", "4", "71.2", "50.0", "+21.2"],
     ]
     bins = tables["Hits by their forecast, all policies"]
     assert bins[1:] == [
         ["10 to 20 %", "1", "15 %", "0 % [0, 79]"],
         ["80 to 90 %", "2", "85 %", "50 % [9, 91]"],
-        ["90 to 100 %", "1", "95 %", "100 % [21, 100]"],
+        ["90 to 100 %", "1", "100 %", "100 % [21, 100]"],
     ]
     stops = tables["Stopping by the spread of the belief"]
     assert stops[4] == [
