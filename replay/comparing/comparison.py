@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -95,11 +95,10 @@ class CommonCost:
 
 def common_cost(recording: Recording) -> CommonCost:
     """The cost of the recorded method; that of the default preset if the recording has none."""
-    try:
+    settings = None
+    with suppress(RecordingError):
         method = recorded_method(recording)
-    except RecordingError:
-        return CommonCost(CostSettings(), "preset default")
-    settings = getattr(method.settings, "cost", None)
+        settings = getattr(method.settings, "cost", None)
     if not isinstance(settings, CostSettings):
         return CommonCost(CostSettings(), "preset default")
     for preset in PRESETS:

@@ -62,6 +62,9 @@ def test_one_cost_that_is_one_ulp_larger_is_found(descent, write, capsys):
     assert "1 of 2 steps equal" in shown
     assert "largest difference: 1 ulp\n" in shown
     assert "environment: " in shown
+    for changes, told in (((), "the same as recorded"), (("numpy 1 for 2",), "numpy 1 for 2")):
+        verdict = dataclasses.replace(verdicts(path)[0], outcome=DIFFERS, environment=changes)
+        assert verdict.report().endswith(f"environment: {told}")
 
 
 def test_another_last_result_shows_in_how_the_next_sets_follow(descent, write):
