@@ -155,7 +155,7 @@ class Session:
         if not isinstance(hand, HandShape | None):
             hand = HandShape.of(_mesh("hand", hand))
         self._hand = hand
-        StreamKey(seed, 0)  # refuses what is no seed
+        StreamKey(seed, 0)  # raises for an invalid seed
         require_positive("free_resolution", free_resolution)
         require_positive("moves", moves, zero=True)
         grid = None
@@ -240,6 +240,7 @@ class Session:
         self.seconds: dict[str, float] = {}
         self._belief: PoseBelief | None = None  # of the result `_believed`
         self._believed: Hypotheses | None = None
+        self._answered: RegistrationProblem | None = None  # whose result `answer` is
         self._decided = -2  # the step of the last decision
         self._taken: set[int] = set()  # actions, of those offered
 
@@ -431,7 +432,7 @@ class Session:
             show=self._show,
         )
         self.seconds |= self.registered.seconds
-        self.answer = self.registered.hypotheses
+        self.answer, self._answered = self.registered.hypotheses, problem
         if self.answer.trust is not None:
             self.trust = self.answer.trust
             self._warn(check_trust(self.trust, noise_of(self.method)))
@@ -538,7 +539,7 @@ class Session:
                 self.answer,
                 symmetry,
                 self._belief,
-                problem=self.problem if self.registered is not None else None,
+                problem=self._answered,
                 noise=noise_of(self.method),
             )
             self._believed = self.answer

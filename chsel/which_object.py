@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -44,15 +43,14 @@ class WhichObject:
         targets: Mapping[str, trimesh.Trimesh] | Sequence[str | Path],
         *,
         record: str | Path | None = None,
-        noise: float = SENSOR_NOISE,
+        noise: float | None = None,
         **given: Any,
     ) -> None:
         """Open a session for each object.
 
         targets: meshes by name, or paths, whose stems are the names. record: a new file NAME.mcap;
-        each object has its own, NAME_OBJECT.mcap. noise: of contacts, metres, one for all
-        objects, so that their energies can be compared. given: the same of
-        all, see `chsel.Session`. Raises SettingError for fewer than two, or two of one name.
+        each object has its own, NAME_OBJECT.mcap. noise, given: the same for all, see
+        `chsel.Session`. Raises SettingError for fewer than two, or two of one name.
         """
         named = targets if isinstance(targets, Mapping) else {Path(t).stem: t for t in targets}
         if len(named) < max(len(targets), 2):
@@ -60,11 +58,14 @@ class WhichObject:
             raise SettingError(f"targets are {shown}; accepted: two or more, of different names")
         self.sessions: dict[str, Session] = {}
         self.candidates: list[Candidate] = []
-        self._noise = noise
+        self._noise = SENSOR_NOISE if noise is None else noise
         path = None if record is None else Path(record)
-        for name, target in named.items():
-            own = None if path is None else path.with_name(f"{path.stem}_{name}{path.suffix}")
-            self.sessions[name] = Session(target, record=own, **given)
+        with ExitStack() as opened:  # if one fails, those before it end
+            for name, target in named.items():
+                own = None if path is None else path.with_name(f"{path.stem}_{name}{path.suffix}")
+                session = Session(target, record=own, noise=noise, **given)
+                self.sessions[name] = opened.enter_context(session)
+            self._open = opened.pop_all()
 
     def add(self, **what: Any) -> None:
         """Add what became known to all, see `Session.add`."""
@@ -81,7 +82,8 @@ class WhichObject:
             answer = session.register()
             assert session.problem is not None
             poses = Poses.of(answer.object_from_world[np.isfinite(answer.cost)])
-            energies = pose_energies(session.problem, poses, noise_model(self._noise))
+            problem = session.problem.carried(answer.push_distance)
+            energies = pose_energies(problem, poses, noise_model(self._noise))
             found.append((float(energies.min(initial=np.inf)), name, answer))
         least = min(energy for energy, *_ in found)
         found.sort(key=lambda one: one[0])
@@ -97,20 +99,12 @@ class WhichObject:
             raise SettingError("nothing is registered; accepted: `register` before `next_probe`")
         return self.sessions[self.candidates[0].name].next_probe(actions)
 
-    def close(self, outcome: str = "finished") -> None:
+    def close(self) -> None:
         """End all recordings."""
-        with ExitStack() as stack:
-            for session in self.sessions.values():
-                stack.callback(session.close, outcome)
+        self._open.close()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        for session in self.sessions.values():
-            session.__exit__(kind, error, trace)
+    def __exit__(self, *error: Any) -> None:
+        self._open.__exit__(*error)

@@ -56,7 +56,7 @@ class ProbingSettings(CheckedSettings):
     # m: by which a push that touches the object then moves it. It turns about its centre, too: if
     # it is 0.2 m long, by a standard deviation of 1 degree for 5 mm, and less if it is longer.
     moves: Annotated[float, between(0.0, 0.1)] = 0.0
-    # m: what registration is told that a push moves the object at most; None: as `moves`.
+    # m: the largest distance per push that registration assumes; None: as `moves`.
     expect_moves: Annotated[float, between(0.0, 0.1)] | None = None
 
     presets: ClassVar[Presets] = {
@@ -71,7 +71,7 @@ class ProbingSettings(CheckedSettings):
 
 
 def expected_moves(session: Mapping[str, Any]) -> float:
-    """What registration is told that a push moves the object at most, metres, by its settings."""
+    """The largest distance per push that registration assumes by a session's settings, metres."""
     told = session.get("expect_moves")
     return float(session.get("moves", 0.0) if told is None else told)
 

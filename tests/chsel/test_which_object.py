@@ -8,7 +8,7 @@ import chsel
 from chsel.problem.poses import apply
 from replay.comparing.verification import EQUAL, verify
 from replay.mcap.reader import read_recording
-from tests.chsel.methods.scene import BOX, BOX_SIDES, TRUTH, on_faces
+from tests.chsel.methods.scene import BOX, BOX_SIDES, TRUTH, WORKSPACE, on_faces
 
 
 def test_the_true_object_comes_first(tmp_path):
@@ -30,3 +30,7 @@ def test_the_true_object_comes_first(tmp_path):
     assert [verdict.outcome for verdict in verdicts] == [EQUAL]
     with pytest.raises(chsel.ChselError, match="accepted: two or more, of different names"):
         chsel.WhichObject(["a.obj", "other/a.obj"])
+    (tmp_path / "again_box.mcap").touch()
+    with pytest.raises(chsel.ChselError, match=r"again_box\.mcap"):
+        chsel.WhichObject(meshes, record=tmp_path / "again.mcap", workspace=WORKSPACE)
+    assert read_recording(tmp_path / "again_slim.mcap").ended.outcome.startswith("failed")
