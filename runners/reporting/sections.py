@@ -265,7 +265,7 @@ def against_baseline(evaluation: Evaluation, baseline: str) -> list[Table]:
                 "n": f"{diversity.count()}" + (f" ({left_out} left out)" if left_out else ""),
                 "PD in mm², median [quartiles]": with_range(median, lower, upper),
                 "geometric mean": geometric_mean(own["floored"]),
-                f"ratio to {baseline}": geometric_mean(own["ratio"]),
+                f"ratio to {baseline} [95 %]": _ratio_cell(own),
                 "worse": "-" if method == baseline else worse,
                 "members": percent(own["exact_members"].mean()),
                 "distinct [least]": f"{number(distinct.mean())} [{number(distinct.min())}]",
@@ -273,12 +273,20 @@ def against_baseline(evaluation: Evaluation, baseline: str) -> list[Table]:
                 "s, mean": float(own["seconds"].mean()),
             }
         )
-    note = f"Members: mean share of hypotheses in the plausible set, {evaluation.definition_text}."
+    note = (
+        f"Members: mean share of hypotheses in the plausible set, {evaluation.definition_text}. "
+        "Intervals by a bootstrap over configurations, or over sessions if these are few."
+    )
     tables = [table_of("PD and its ratios over all registrations", lines, note=note)]
     for by in ("object", "step"):
         found = rows.groupby([by, "method"])["ratio"].agg(geometric_mean).map(number).unstack()
         tables.append(pivot_table(f"Ratios of PD by {by}, geometric means", found, styles))
     return tables
+
+
+def _ratio_cell(rows: pd.DataFrame) -> str:
+    mean, lower, upper = statistics.ratio_interval(rows)
+    return with_range(mean, lower, upper) if math.isfinite(lower) else number(mean)
 
 
 def pd_over_probes(name: str, rows: pd.DataFrame, styles: Styles) -> Picture | None:

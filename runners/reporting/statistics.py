@@ -22,7 +22,7 @@ GOOD = 0.010  # metres: what counts as found
 REFERENCE = "information"  # with which all policies are compared, unless another is asked for
 PROBES = 10  # after so many errors are compared, or at the end of shorter sessions
 SESSION = ["policy", *TRIAL]  # the columns that tell sessions apart
-_RESAMPLES = 2000
+_RESAMPLES, _FEW = 2000, 5
 
 
 def spreads(rows: pd.DataFrame, by: str | Sequence[str], column: str) -> pd.DataFrame:
@@ -62,6 +62,13 @@ def geometric_mean(values: pd.Series) -> float:
     return math.exp(np.log(values).mean())
 
 
+def ratio_interval(rows: pd.DataFrame) -> tuple[float, float, float]:
+    """Geometric mean of `with_ratios`, and its 95 % interval, NaN of a single session."""
+    logs = np.log(rows.set_index(TRIAL)["ratio"].dropna())
+    mean, lower, upper = (math.exp(log) for log in (logs.mean(), *bootstrap_interval(logs)))
+    return mean, lower, upper
+
+
 def with_ratios(rows: pd.DataFrame, baseline: str) -> pd.DataFrame:
     """The rows with `floored`, PD of at least LEAST_PD, and `ratio`, that by the baseline's.
 
@@ -75,8 +82,14 @@ def with_ratios(rows: pd.DataFrame, baseline: str) -> pd.DataFrame:
 
 
 def bootstrap_interval(values: pd.Series) -> tuple[float, float]:
-    """95 % interval of the mean of values by (configuration, seed), configurations resampled."""
-    groups = values.groupby("configuration")
+    """95 % interval of the mean of values by (configuration, seed), configurations resampled.
+
+    Sessions are resampled if there are less than _FEW configurations; NaN of a single session.
+    """
+    many = values.index.get_level_values("configuration").nunique() >= _FEW
+    groups = values.groupby("configuration" if many else TRIAL)
+    if len(groups) < 2:
+        return math.nan, math.nan
     sums, counts = groups.sum().to_numpy(), groups.count().to_numpy()
     drawn = np.random.default_rng(0).integers(len(sums), size=(_RESAMPLES, len(sums)))
     means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1).clip(min=1)

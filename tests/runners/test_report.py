@@ -140,7 +140,7 @@ def test_ratios_are_of_the_same_trial_and_step_by_the_mean_of_the_baselines_draw
         "n": "3 (1 left out)",
         "PD in mm², median [quartiles]": "20 [10, 210]",
         "geometric mean": "20",  # of 20, 400 and 1, as which 0 counts
-        "ratio to package": "0.126",  # of 20 / 200, 400 / 200 and 1 / 100
+        "ratio to package [95 %]": "0.126",  # of 20 / 200, 400 / 200 and 1 / 100
         "worse": "33.3 %",
         "members": "60.0 %",
         "distinct [least]": "30 [30]",
