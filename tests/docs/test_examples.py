@@ -38,3 +38,4 @@ def test_the_notebook_goes_from_contacts_to_one_mode(monkeypatch, tmp_path):
     text = "".join(output.get("text", "") for output in outputs)
     assert re.search(r"several modes \(6 modes.*determined.* [01]\.\d mm from the true", text, re.S)
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
+    assert "application/vnd.jupyter.widget-view+json" in outputs[-1]["data"]  # the viewer
