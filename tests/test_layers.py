@@ -3,9 +3,6 @@
 import ast
 import re
 import shutil
-import subprocess
-import sys
-import venv
 from collections import Counter
 
 import pytest
@@ -120,69 +117,4 @@ def test_no_file_imports_one_above_it_and_none_in_a_circle(package):
     assert forbidden_imports(graph) == circles(graph) == []
 
 
-def plant(root, files):
-    """Write files of a package chsel; the graph of their imports."""
-    for name, text in files.items():
-        file = root / "chsel" / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(text)
-        (file.parent / "__init__.py").touch()
-    (root / "chsel" / "__init__.py").touch()
-    return import_graph(root)
-
-
-ABOVE = {
-    "numerics/a.py": "from chsel.problem.b import Points",
-    "problem/b.py": "def f():\n    import chsel.cost.c",
-    "cost/c.py": "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from ..qd import d",
-    "plausible/e.py": "from chsel.methods import icp",
-    "sensing/f.py": "from chsel.cost.c import Cost",
-    "qd/d.py": "from chsel.api import register",
-    "errors.py": "from chsel.numerics import a",
-    "methods/icp/icp.py": "from chsel.methods.svgd import Svgd",
-    "methods/svgd.py": "from chsel.methods import build_method",
-}
-
-
-CIRCLE = {
-    "cost/d.py": "from chsel.cost.e import B",
-    "cost/e.py": "def f():\n    from chsel.cost.f import C",
-    "cost/f.py": "from chsel.cost import d",
-}
-
-
-def test_an_arrow_back_up_and_a_circle_inside_a_folder_are_seen(tmp_path):
-    found = forbidden_imports(plant(tmp_path, {**ABOVE, "api.py": ""}))
-    names = {module_name(tmp_path / "chsel" / name, tmp_path) for name in ABOVE}
-    assert {line.split()[0] for line in found} == names
-    assert len(found) == len(ABOVE)
-    (circle,) = circles(plant(tmp_path / "other", CIRCLE))
-    assert circle == ["chsel.cost.d", "chsel.cost.e", "chsel.cost.f"]
-
-
 pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-
-
-def made(folder, *words):
-    for name in ("Makefile", "constraints.txt", "pyproject.toml"):
-        shutil.copy(REPOSITORY / name, folder)
-    command = ["make", f"PYTHON={sys.executable}", *words]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
-
-
-@pytest.mark.parametrize("version", [None, "2.9.1+cpu"])
-def test_a_torch_that_is_there_stays(version, tmp_path):
-    venv.create(tmp_path / ".venv", with_pip=False)
-    if version is not None:
-        (packages,) = (tmp_path / ".venv").glob("lib/python*/site-packages")
-        metadata = packages / f"torch-{version}.dist-info" / "METADATA"
-        metadata.parent.mkdir()
-        metadata.write_text(f"Metadata-Version: 2.1\nName: torch\nVersion: {version}\n")
-    made(tmp_path, ".venv/constraints.txt")
-    asked = (tmp_path / ".venv" / "constraints.txt").read_text().splitlines()
-    pinned = (REPOSITORY / "constraints.txt").read_text().splitlines()
-    torch = [line for line in pinned if line.startswith("torch==")]
-    assert len(torch) == 1
-    assert asked == [line for line in pinned if version is None or line not in torch]

@@ -80,37 +80,6 @@ def test_every_command_has_a_script_and_each_names_its_version(ran):
         assert (done.returncode, done.stdout) == (0, f"chsel-replay {PROJECT['version']}\n")
 
 
-COMPLETED = """
-eval "$(chsel-probe -sc install=bash)"
-complete -o nospace -o default -F hydra_bash_completion chsel-evaluate
-eval "$(register-python-argcomplete chsel-replay)"
-completed() {
-    COMP_LINE="$*" COMP_POINT=${#COMP_LINE} COMP_WORDS=($*) COMP_CWORD=$(($# - 1)) COMPREPLY=()
-    local function=$(complete -p "$1" | sed -E 's/.* -F ([^ ]+) .*/\\1/')
-    $function "$1" "$3" "$2"
-    echo ${COMPREPLY[@]}
-}
-completed chsel-probe object=cl
-completed chsel-probe seed=1 method=medial
-completed chsel-evaluate experiment=sm
-completed chsel-replay ver
-completed chsel-replay verify --j
-"""
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
-def test_bash_completes_the_scripts(ran):
-    done = ran("bash", "-c", COMPLETED)
-    assert done.stderr == ""
-    assert done.stdout.splitlines() == [
-        "object=clamp",
-        "method=medial_constraint method=medial_constraint_cma_me",
-        "experiment=smoke",
-        "verify",
-        "--jobs",
-    ]
-
-
 def test_the_citation_is_of_this_version():
     citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
     assert {"cff-version", "message", "title", "authors"} <= set(citation)

@@ -17,7 +17,6 @@ BOX = trimesh.creation.box((0.1, 0.06, 0.04))
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.4)), np.array([0.3, 0.1, 0.2]))
 SURFACE = apply(POSE, trimesh.sample.sample_surface(BOX, 40, seed=0)[0])
 QUICK = {"descent": {"restarts": 2, "iterations": 10}, "emitter": {"iterations": 5}}
-DOWN = np.diag([1.0, -1.0, -1.0])
 POINT = [[0.1, 0.2, 0.3]]
 
 

@@ -182,25 +182,6 @@ def test_everything_is_saved(path, tmp_path, capsys):
     assert len(list(RrdReader(saved["rrd"]).stream())) > 3
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--save-plot", "out.jpg"], "out.jpg is not the name of a picture; accepted: *.png"),
-        (["--save-plot", "out.png", "--save-csv", "out.png"], "out.png is named twice"),
-        (["--threads", "0"], "--threads is 0; accepted: an integer from 1 to 256"),
-        (["--out", "all.mcap"], "--out records one registration; accepted: with one method and"),
-    ],
-)
-def test_what_cannot_work_is_told_before_any_work(
-    path, tmp_path, monkeypatch, capsys, words, message
-):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("replay.comparing.comparison.register_recorded", None)
-    assert main(["compare", str(path), "--methods", "chsel", *words]) == 2
-    assert message in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_method_that_fails_leaves_the_others_alone(path, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     registered = type(build_method("gradient_descent")).register

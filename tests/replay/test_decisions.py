@@ -18,7 +18,6 @@ from replay.comparing.differences import result_differences
 from replay.comparing.verification import DIFFERS, EQUAL, verify
 from replay.mcap.reader import read_recording
 from replay.verbs.compare import policy_decisions
-from replay.verbs.info import recording_info
 from tests.replay.conftest import changed, nth, same_bits
 from tests.tools.small_recordings import STEERED, steered_session
 
@@ -124,20 +123,6 @@ def test_a_recovered_recording_is_verified_as_far_as_it_goes(steered, write):
     assert len(found) == 6
 
 
-def test_info_names_the_policy_and_how_it_stopped(steered_events, write, capsys):
-    path = write(steered_events)
-    last = read_recording(path).decision(2).decision
-    expected = {"name": "dice", "stop": "spread", "spread": last.spread}
-    assert recording_info(path)["policy"] == expected
-    assert main(["info", str(path)]) == 0
-    shown = " ".join(capsys.readouterr().out.split())
-    spread = f"{1000.0 * last.spread:.1f} mm"
-    assert f"policy dice, decisions 4, stopped by spread, spread of the poses {spread}" in shown
-    cut = [e for e in steered_events if not isinstance(e, Decided) or e.step < 2]
-    unknown = {"name": "dice", "stop": None, "spread": None}
-    assert recording_info(write(cut))["policy"] == unknown
-
-
 def test_decisions_are_exported_in_three_forms(steered_events, write, tmp_path):
     path = str(write(steered_events))
     outs = {name: tmp_path / f"out.{name}" for name in ("csv", "json", "npz")}
@@ -200,16 +185,6 @@ def test_start_and_direction_are_the_hands_place_and_its_z_axis(steered):
     forward, place = pose @ [0.0, 0.0, 1.0, 0.0], pose @ [0.0, 0.0, 0.0, 1.0]
     assert [row[name] for name in ("dx", "dy", "dz")] == pytest.approx(forward[:3], abs=1e-15)
     assert [row[name] for name in ("x_m", "y_m", "z_m")] == pytest.approx(place[:3], abs=1e-15)
-
-
-def test_step_shows_a_row_for_each_policy(path, capsys):
-    words = ["--policy", "information", "policy.noise=0.5", "--policy", "information"]
-    assert main(["step", str(path), "--step", "1", *words]) == 0
-    shown = capsys.readouterr().out
-    rows = [line.split() for line in shown.splitlines() if re.match(r" *1 ", line)]
-    assert [row[1] for row in rows] == ["information", "information", "information#2"]
-    assert rows[0][2:] == rows[2][2:] != rows[1][2:]
-    assert "information with policy.noise=0.5" in shown
 
 
 def test_compare_counts_agreement_and_writes_a_table(path, tmp_path, capsys):

@@ -5,18 +5,12 @@ import math
 import re
 
 import numpy as np
-import trimesh
 
 from chsel.events import (
     HypothesesFound,
     Measured,
-    Probe,
-    RigDescribed,
-    SensorImage,
-    SessionStarted,
     Traced,
 )
-from chsel.problem.sdf_grid import SdfGrid
 from replay.__main__ import main
 from replay.verbs.diff import FIRST, SECOND, recording_diff
 from tests.replay.conftest import changed, nth
@@ -89,33 +83,3 @@ def test_signed_zeros_differ_and_equal_nan_do_not(events, write):
     ]
     assert found[2].startswith("/measured, step 1: values.number_3: inf -> -inf (")
     assert len(found) == 3
-
-
-def test_mesh_grid_points_and_pixels_are_compared_by_number(sensor_events, write):
-    kinds = (SessionStarted, RigDescribed, SensorImage, Probe)
-    start, rig, image, probe = (nth(sensor_events, kind) for kind in kinds)
-    mesh = trimesh.Trimesh(start.mesh.vertices.copy(), start.mesh.faces, process=False)
-    mesh.vertices[3, 1] = np.nextafter(mesh.vertices[3, 1], 1.0)
-    grid = np.array(start.sdf.values)
-    grid.reshape(-1)[7] += 1.0
-    sdf = SdfGrid(start.sdf.origin, start.sdf.resolution, grid, np.array(start.sdf.gradients))
-    free, pixels = probe.new_points.free.copy(), image.values.copy()
-    free[0, 1] = np.nextafter(free[0, 1], 9.0)
-    pixels[2, 3] ^= 1
-    others = [
-        dataclasses.replace(start, mesh=mesh, sdf=sdf),
-        rig,
-        dataclasses.replace(image, values=pixels),
-        dataclasses.replace(probe, new_points=dataclasses.replace(probe.new_points, free=free)),
-    ]
-    first, second = write([start, rig, image, probe]), write(others)
-    found = texts(first, second)
-    patterns = (
-        r"/session, start: mesh.vertices: 1 of 24 numbers by up to 1 ulp .*, the first at 10",
-        r"/session, start: sdf.values: 1 of \d+ numbers .*, the first at 7",
-        r"/sensor_image, step 0, camera: values: 1 of 35 entries, the first at 17",
-        r"/probe, step 0: new_points.free: 1 of 120 numbers by up to 1 ulp .*, the first at 1",
-    )
-    for pattern, text in zip(patterns, found, strict=True):
-        assert re.fullmatch(pattern, text)
-    assert texts(first, second, "mesh", "sdf", "/probe", "/sensor_image") == []

@@ -83,12 +83,6 @@ def test_a_broken_file_fails_and_the_others_run(pytester, stored):
     result.stdout.fnmatch_lines(["recording *cut.mcap is unfinished*"])
 
 
-def test_a_folder_that_does_not_exist_is_one_clear_line(pytester):
-    result = pytester.runpytest_inprocess("--replays", "nowhere")
-    assert result.ret == pytest.ExitCode.USAGE_ERROR
-    result.stderr.fnmatch_lines(["ERROR: --replays nowhere does not exist*"])
-
-
 def test_every_object_and_method_has_stored_replays_of_a_modest_size():
     files = list(REPLAYS.glob("*.mcap"))
     sizes = [file.stat().st_size for file in files]

@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
 import threading
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import pytest
-from rerun.chunk import RrdReader
 
 from chsel.errors import RecordingError
 from chsel.events import Measured
-from chsel.problem import online_registration as online
-from replay.__main__ import main
-from replay.files import WritingError, new_file, whole_file
+from replay.files import new_file
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
 from replay.recorder import Recorders
-from tests.tools.kill_sessions import PROBES, points_session, reported_probes
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-STORED = REPOSITORY / "tests" / "replays" / "spam_can_icp.mcap"
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
 
 
@@ -76,24 +67,6 @@ def test_files_and_pictures_get_everything_in_order_at_a_flush():
     assert file.calls == pictures.calls == [1, 2, "flush", 3, "close"]
     assert file.threads == {threading.current_thread()}
     assert threading.current_thread() not in pictures.threads
-
-
-def test_who_records_faster_than_the_pictures_are_drawn_has_to_wait():
-    pictures = Gate(is_open=False)
-    recorder = Recorders([], pictures)
-
-    def record():
-        for event in range(1000):
-            recorder.record(event)
-
-    caller = threading.Thread(target=record)
-    caller.start()
-    caller.join(0.2)
-    assert caller.is_alive()
-    pictures.gate.set()
-    caller.join(60)
-    recorder.close()
-    assert pictures.calls == [*range(1000), "close"]
 
 
 @pytest.mark.parametrize("end", ["flush", "close"])
@@ -197,30 +170,6 @@ def test_a_recording_is_on_the_disk_when_it_is_closed(events, tmp_path, synced):
     assert synced.holds(path)
 
 
-def test_an_accepted_recording_is_on_the_disk(tmp_path, synced, monkeypatch):
-    drawn = online.normals
-    monkeypatch.setattr(online, "normals", lambda stream, shape: -drawn(stream, shape))
-    accepted = Path(shutil.copy(STORED, tmp_path / "accepted.mcap"))
-    before = accepted.stat().st_ino
-    assert main(["accept", str(accepted), "--yes"]) == 0
-    assert accepted.stat().st_ino != before
-    assert synced.holds(accepted)
-
-
-@pytest.mark.parametrize("make", [whole_file, new_file])
-def test_new_files_are_on_the_disk_and_a_full_one_is_named(make, tmp_path, synced):
-    path, full = tmp_path / "out.txt", tmp_path / "full.txt"
-    with make(path) as beside:
-        beside.write_text("text")
-    assert synced.holds(path)
-    with (
-        pytest.raises((RecordingError, WritingError), match=r"full\.txt cannot be written.*space"),
-        make(full),
-    ):
-        raise OSError(errno.ENOSPC, "No space left on device")
-    assert sorted(os.listdir(tmp_path)) == ["out.txt"]
-
-
 def test_a_link_to_nothing_is_not_written_over(tmp_path):
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
     with pytest.raises(RecordingError, match="link exists"), new_file(tmp_path / "link"):
@@ -244,34 +193,3 @@ def test_every_reported_probe_survives_kills_at_random_moments():
     assert kills == 30
     assert without + ended < 0.7 * kills  # most kills came in between
     assert kills < reported <= recovered
-
-
-@pytest.mark.slow
-def test_a_killed_command_leaves_both_files_readable(tmp_path, capsys):
-    command = [sys.executable, "-u", "-m", "runners.probe", *points_session(tmp_path)]
-    command += ["method=chsel", "method.descent.restarts=2", "method.descent.iterations=20"]
-    command += [f"logs={tmp_path}", "recording=both"]
-    command += ["method.emitter.iterations=2000"]  # so that the kill is not too late
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT)
-    assert process.stdout is not None
-    output = ""
-    for line in process.stdout:
-        output += line
-        if reported_probes(output) == 3:
-            time.sleep(np.random.default_rng(3).uniform(0.0, 0.05))
-            process.send_signal(signal.SIGKILL)
-            break
-    output += process.stdout.read()
-    assert process.wait(timeout=60) == -signal.SIGKILL
-    reported = reported_probes(output)
-    assert 3 <= reported <= PROBES
-    (path,) = tmp_path.rglob("recording.mcap")
-    assert main(["recover", str(path), "-o", str(tmp_path / "recovered.mcap")]) == 0
-    recovered = read_recording(tmp_path / "recovered.mcap")
-    assert f"kept: {len(recovered.probes)} probes" in capsys.readouterr().out
-    assert [probe.step for probe in recovered.probes][:reported] == list(range(reported))
-    for step in range(reported):
-        assert recovered.problem(step).points.count > 0
-        assert recovered.hypotheses(step).object_from_world.shape == (30, 4, 4)
-    chunks = RrdReader(path.with_suffix(".rrd")).stream().to_chunks()
-    assert any("hypotheses" in chunk.entity_path for chunk in chunks)

@@ -7,13 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from chsel.errors import RecordingError
 from chsel.events import HypothesesFound, SessionEnded
 from replay.__main__ import main
 from replay.comparing.choices import METHOD, chosen
 from replay.comparing.verification import EQUAL, verify
 from replay.environment import environment
-from replay.files import file_digest
 from replay.mcap.reader import read_recording
 from tests.tools.small_recordings import registered_session, write_recording
 
@@ -103,11 +101,3 @@ def test_what_does_not_exist_is_named(step, capsys, words, message):
     assert message in said
     assert said.count("\n") == 1
     assert not list(Path().iterdir())
-
-
-def test_a_digest_names_a_file_as_b2sum_does(tmp_path):
-    path = tmp_path / "file"
-    path.write_bytes(b"abc")
-    assert file_digest(path) == "cf4ab791c62b8d2b2109c90275287816"
-    with pytest.raises(RecordingError, match="nowhere cannot be read: No such file"):
-        file_digest(tmp_path / "nowhere")

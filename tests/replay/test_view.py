@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import signal
@@ -12,7 +11,6 @@ import urllib.request
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 from rerun.blueprint.components import PlayState
 
 from chsel.events import HypothesesFound, Probe, ProblemPosed, Timed
@@ -119,16 +117,6 @@ def test_info_tells_what_the_session_was(events, write):
     assert info["integrity"] == {"whole": True, "damage": None}
 
 
-def test_messages_are_counted_with_their_bytes(any_events, write):
-    path = write(any_events)
-    info = recording_info(path)
-    with path.open("rb") as file:
-        stored = [(c.topic, len(m.data)) for _, c, m in make_reader(file).iter_messages()]
-    assert sum(info["message_bytes"].values()) == sum(size for _, size in stored)
-    topics = [topic for topic, _ in stored]
-    assert info["messages"] == {topic: topics.count(topic) for topic in topics}
-
-
 def test_what_is_not_whole_is_told(events, write, capsys):
     path = write(events)
     path.write_bytes(path.read_bytes()[:-1])
@@ -146,22 +134,6 @@ def test_a_problem_without_a_result_counts_as_no_registration(events, write, cap
     assert recording_info(path)["registrations"] == 1
     assert main(["info", str(path)]) == 0
     assert "no result" in capsys.readouterr().out
-
-
-def test_json_is_standard_and_a_list_of_several(events, write, tmp_path, capsys):
-    path, log, other = write(events), tmp_path / "log.mcap", tmp_path / "other.mcap"
-    assert main(["info", str(path), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["steps"][0]["best_cost"] is None
-    write_ros2(log, ros2_sent())
-    other.write_bytes(b"no recording")
-    assert main(["info", str(path), str(log), str(other), "--json"]) == 2
-    shown = capsys.readouterr()
-    recording, of_log, failed = json.loads(shown.out)
-    assert recording["message_bytes"]["/probe"] > 0
-    assert {topic["topic"] for topic in of_log["topics"]} >= {"/tf", "/depth"}
-    assert "is not an MCAP file; accepted: " in failed["error"]
-    assert shown.err.startswith("error: recording")
-    assert shown.err.count("\n") == 1
 
 
 def test_topics_types_counts_and_rates_of_a_log(tmp_path, capsys):

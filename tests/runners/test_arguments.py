@@ -1,6 +1,5 @@
 """Files whose names Hydra would read as its own grammar, as they are typed in a shell."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -11,20 +10,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from chsel.errors import SettingError
-from runners import evaluate, plausible, probe, real
+from runners import evaluate, real
 from runners.command.arguments import hydra_arguments, quoted
 from tests.runners.in_process import run
 
 NAMES = ("a,b [1].obj", "it's 'so'", "Prüfkörper", "a\\'b", "a#b")
-SHORT = ("recording=mcap", "method=gradient_descent", "method.descent.restarts=1")
-COARSE = (
-    "definition.epsilon=0.01",
-    "definition.grid.rotations=200",
-    "definition.grid.upright=4",
-    "definition.grid.offsets.x=[[-0.01,0.01,3]]",
-    "definition.grid.offsets.y=[[0,0,1]]",
-    "definition.grid.offsets.z=[[0,0,1]]",
-)
 
 
 def value_of(word):
@@ -69,26 +59,6 @@ def home(tmp_path, monkeypatch):
     free = np.array([[0.4, 0.0, 0.0], [0.0, 0.4, 0.0]])
     np.savez(tmp_path / "Prüf körper,1.npz", surface=points, free=free, world_from_object=np.eye(4))
     return tmp_path
-
-
-def test_a_session_of_strange_files_runs_from_the_command_to_the_replay(home, monkeypatch):
-    monkeypatch.chdir(home)
-    done = run(
-        probe.main,
-        "session=points",
-        "session.path=~/Prüf körper,1.npz",
-        "object=mesh",
-        "object.path=a,b [c]'d.obj",
-        "logs=~/läufe [1],x",
-        *SHORT,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    (folder,) = (home / "läufe [1],x" / "probe").iterdir()
-    assert json.loads((folder / "summary.json").read_text())["outcome"] == "finished"
-    recording = shutil.copy(folder / "recording.mcap", home / "x=1,[2].mcap")
-    done = run(plausible.main, Path(recording).name, *COARSE, "out=~/s,1")
-    assert (done.returncode, done.stderr) == (0, ""), done.stdout
-    assert list((home / "s,1").iterdir())
 
 
 def test_words_without_a_key_get_that_of_the_command(tmp_path, monkeypatch):

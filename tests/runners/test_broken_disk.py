@@ -76,16 +76,6 @@ def test_a_full_disk_is_one_error_and_every_reported_probe_stays(session, tmp_pa
     assert json.loads((folder / "summary.json").read_text())["outcome"] == f"failed: {reason}"
 
 
-def test_a_disk_that_is_full_for_the_pictures_alone_is_told(session, tmp_path):
-    process = start(tmp_path, *session, "recording=rerun", limit=500_000)
-    _, errors = process.communicate(timeout=TIMEOUT)
-    assert process.returncode == 2
-    path = run_folder(tmp_path) / "recording.rrd"
-    assert only_error(errors) == (
-        f"error: recording {path} cannot be written: the disk may be full"
-    )
-
-
 def test_output_that_nobody_reads_ends_the_run_with_a_whole_recording(session, tmp_path):
     """As with `| head`: no error is printed, and the status is that of a broken pipe."""
     process = start(tmp_path, *session, "recording=both")

@@ -6,13 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 import trimesh
 
 from chsel.problem.poses import apply, axis_angle, compose
-from runners.run.display import compiling_line
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
@@ -89,30 +87,3 @@ def test_a_session_needs_no_kernel_that_is_not_there_before_its_first_probe(
     before, more = re.findall(r"compiled (\d+) more (.*)", done.stdout)[0]
     assert int(before) > 5
     assert more == "[]"
-
-
-def test_the_line_counts_and_stays(capsys):
-    with compiling_line():
-        for _ in range(2):
-
-            def kernel(x):
-                return x + 1.0
-
-            kernel.__module__ = "chsel.made_up"
-            assert numba.njit(kernel)(1.0) == 2.0
-    shown = capsys.readouterr()
-    assert re.fullmatch(r"compiling kernels, once: 2 compiled, 0:00:0\d *\n", shown.out)
-    assert shown.err == ""
-
-
-def test_a_first_session_compiles_before_its_first_probe(points, tmp_path):
-    command = [sys.executable, "-m", "runners.probe", *points, "method=icp", f"logs={tmp_path}"]
-    environment = {**os.environ, "CHSEL_CACHE_DIR": str(tmp_path / "kept"), "OMP_NUM_THREADS": "2"}
-    environment["PYTHONPATH"] = str(REPOSITORY)
-    start = ("session.start_contacts=0", "session.start_probe=2")
-    done = subprocess.run([*command, *start], capture_output=True, text=True, env=environment)
-    assert (done.returncode, done.stderr) == (0, "")
-    lines = [line.split()[0] for line in done.stdout.splitlines() if line.strip()]
-    begun = lines.index("compiling")
-    assert lines.index("probe") > begun
-    assert len(list(tmp_path.glob("kept/*/*.nbc"))) > 10

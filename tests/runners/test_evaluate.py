@@ -195,15 +195,6 @@ def test_a_mistake_is_one_line_on_stderr(folder, arguments, message):
     assert stamps(folder) == before
 
 
-def test_jobs_of_a_sweep_share_a_folder(tmp_path):
-    done = evaluated(tmp_path, "-m", "methods=icp", "configurations=can,box", "steps='4'")
-    assert (done.returncode, done.stderr) == (0, "")
-    results = table(tmp_path)
-    assert [row["configuration"] for row in results] == ["box", "can"]
-    told = json.loads((tmp_path / "experiment.json").read_text())
-    assert told["configurations"] == ["box", "can"]
-
-
 @pytest.mark.usefixtures("interruptible")
 def test_an_interrupted_run_goes_on_and_a_killed_one_leaves_nobody_at_work(tmp_path):
     slow = ("settings.chsel.emitter.iterations=1000000", "methods=chsel", "workers=1")

@@ -5,16 +5,12 @@ from __future__ import annotations
 import json
 import os
 import signal
-from collections.abc import Callable
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
-from distributed import Client
-from filelock import FileLock, Timeout
 
 from chsel.errors import ChselError, SettingError
 from chsel.methods.icp import Icp
@@ -30,12 +26,11 @@ from replay.comparing.verification import EQUAL, NO_RESULT, verify
 from replay.mcap.reader import read_recording
 from runners.evaluation import tasks
 from runners.evaluation.contenders import Contender, chosen_contenders
-from runners.evaluation.experiment import collect, join_experiment, writing_alone
+from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.metrics import MetricsConfig
 from runners.evaluation.plan import OWN, Plan, Task, Trial
 from runners.evaluation.run_method import ResultRows, read_external
 from runners.evaluation.tasks import (
-    checked_size,
     connected,
     do_tasks,
     is_finished,
@@ -83,9 +78,6 @@ def session(tmp_path_factory):
     plan = plan_in(tmp_path_factory.mktemp("session"))
     assert do_task(plan, Task(TRIAL)) == ""
     return TRIAL.folder(plan)
-
-
-MakePlan = Callable[..., Plan]
 
 
 @pytest.fixture
@@ -143,9 +135,6 @@ def test_a_contender_has_its_preset_and_changes_by_method_label_and_entry():
         chosen_contenders(["icp", {"name": "icp", "label": "icp+1"}], {}, "default", draws=2)
 
 
-Cluster = tuple[Client, int]
-
-
 @pytest.fixture(scope="module")
 def cluster():
     """A cluster of one worker."""
@@ -186,12 +175,6 @@ def test_a_worker_that_dies_once_costs_nothing_and_twice_its_task_alone(
     assert finished(plan, cluster) == {"always": ""}  # the same command tries again
     assert {row["status"] for row in results(plan)} == {"ok"}
     assert not list(TRIAL.folder(plan).glob("*failed*"))
-
-
-def test_workers_of_several_threads_are_refused():
-    client = SimpleNamespace(nthreads=lambda: {"tcp://a": 1, "tcp://b": 4})
-    with pytest.raises(SettingError, match="a worker has 4 threads; accepted: one"):
-        checked_size(client)
 
 
 class _FailsAtFour(Icp):
@@ -352,17 +335,3 @@ def test_a_session_with_faults_is_measured_by_the_plausible_sets_of_that_without
     assert (
         rows.row(recording.problem(5), exact)["exact_members"] == 1.0
     )  # by contacts without noise
-
-
-def test_a_second_run_in_a_folder_waits_for_the_first(tmp_path):
-    lock, said = FileLock(tmp_path / ".lock"), list[str]()
-    lock.acquire()
-
-    def end_the_first(line):
-        said.append(line)
-        lock.release()
-
-    with writing_alone(tmp_path, end_the_first):
-        assert said == [f"another run is at work in {tmp_path}; this one waits until it ends"]
-        with pytest.raises(Timeout):
-            lock.acquire(timeout=0)

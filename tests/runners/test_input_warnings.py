@@ -1,7 +1,6 @@
 """Input that is hardly meant: said on the terminal, in the log, and in the summary."""
 
 import json
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -11,7 +10,7 @@ from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from replay.mcap.reader import read_recording
 from runners.probe import main
-from tests.runners.in_process import Done, run
+from tests.runners.in_process import run
 
 BOX = trimesh.creation.box((0.1, 0.06, 0.2))
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
@@ -25,7 +24,6 @@ QUICK = (
     "method.descent.iterations=50",
     "method.emitter.iterations=10",
 )
-Found = tuple[Done, list[dict[str, Any]], list[tuple[int, str]]]
 
 
 def probe(folder, *overrides, points, mesh=BOX):
@@ -107,27 +105,3 @@ def test_warnings_about_the_object_come_first_and_are_recorded_too(tmp_path):
     ]
     assert [text for _, text in logged] == said(done) == [each["text"] for each in told]
     assert done.stdout.index("warning: ") < done.stdout.index("probe   0")
-
-
-def test_a_recording_of_such_points_gives_the_warnings_again(tmp_path):
-    surface = SURFACE.copy()
-    surface[15] = [5.0, 0.0, 0.0]
-    _, told, _ = probe(tmp_path, points=sequence(surface))
-    (recording,) = (tmp_path / "logs").rglob("recording.mcap")
-    again = tmp_path / "again"
-    source = ["session=recorded", f"session.path={recording}", f"logs={again}"]
-    done = run(main, *source, *QUICK, "recording=mcap", columns=1000)
-    assert done.returncode == 0, done.stderr
-    (summary,) = again.rglob("summary.json")
-    assert json.loads(summary.read_text())["warnings"] == told
-    assert said(done) == [each["text"] for each in told]
-
-
-def test_a_simulated_session_gives_no_warning(tmp_path):
-    """Its object is larger than life on purpose."""
-    chosen = ["session=kinematic", "object=spam_can", "session.start_probe=11"]
-    done = run(main, *chosen, "recording=mcap", f"logs={tmp_path}")
-    assert done.returncode == 0, done.stderr
-    assert said(done) == []
-    (summary,) = tmp_path.rglob("summary.json")
-    assert json.loads(summary.read_text())["warnings"] == []

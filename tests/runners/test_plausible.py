@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.errors import SettingError
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import load_plausible, plausible_set, read_plausible
-from chsel.plausible.plausible_settings import DEFINITIONS, definition_name, plausible_settings
+from chsel.plausible.plausible_settings import plausible_settings
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, axis_angle, compose
 from chsel.problem.registration_problem import RegistrationProblem
@@ -19,7 +18,6 @@ from chsel.problem.settings import settings_mapping
 from chsel.problem.streams import StreamKey
 from replay.mcap.reader import read_recording
 from runners import plausible, probe
-from runners.evaluation.metrics import definition_label
 from runners.sensors.pose_file import beside, write_pose
 from tests.chsel.plausible.scenes import WORKSPACE, ball
 from tests.runners.in_process import run
@@ -149,24 +147,6 @@ def definition(name, **changes):
     return {"name": name, **values, **changes}
 
 
-def test_every_definition_has_its_own_name_and_changed_ones_have_others():
-    assert [definition_label(definition(name)) for name in DEFINITIONS] == list(DEFINITIONS)
-    assert [definition_name(plausible_settings(name, 0.02)) for name in DEFINITIONS] == list(
-        DEFINITIONS
-    )
-    changed = [
-        definition("default", fill_to=40),
-        definition("default", fill_to=41),
-        definition("default", epsilon=0.002),
-        definition("wide_sums", epsilon=0.002),
-    ]
-    labels = [definition_label(one) for one in changed]
-    assert [label[:-8] for label in labels] == ["default~"] * 3 + ["wide_sums~"]
-    assert len(set(labels)) == 4
-    disguised = {**definition("paper"), "name": "wide_means"}
-    assert definition_label(disguised) == "paper"
-
-
 @pytest.mark.parametrize(("name", "expected"), [("wide_sums", 0.02), ("wide_means", 0.005)])
 def test_wide_definitions_add_up_contacts_or_take_their_mean(name, expected):
     """A ball that is 5 mm off four contacts on its sides."""
@@ -182,8 +162,3 @@ def test_wide_definitions_add_up_contacts_or_take_their_mean(name, expected):
     assert cost == pytest.approx(expected, rel=0.02)
     assert settings.fill_to == 300
     assert settings.cost.tolerance == 0.0
-
-
-def test_a_definition_that_cannot_be_is_named():
-    with pytest.raises(SettingError, match=r"definition\.cost: combine is 'medians'"):
-        definition_label({"name": "mine", "cost": {"combine": "medians"}})

@@ -15,7 +15,7 @@ from runners.reporting.sections import pd_over_probes, sections_of
 from runners.reporting.statistics import spreads
 from runners.reporting.tables import median_cells
 from tests.runners.in_process import run
-from tests.runners.made_up_evaluations import row, tables_of, write_evaluation, write_table
+from tests.runners.made_up_evaluations import row, tables_of, write_evaluation
 
 SUMMARY = "PD and its ratios over all registrations"
 
@@ -227,27 +227,6 @@ def test_a_report_has_its_pictures_its_data_and_the_same_bytes_each_time(compare
     assert f"runners.report {compared} baseline=package" in text
     assert SUMMARY in text
     assert SUMMARY in done.stdout
-
-
-def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(tmp_path):
-    planned = {"configurations": ["can"], "seeds": [0], "methods": {"icp": {}, "svgd": {}}}
-    write_evaluation(tmp_path, None, **planned)
-    trial = tmp_path / "trials" / "can" / "seed_0"
-    trial.mkdir(parents=True)
-    about = {"definition": "default"}
-    write_table(trial / "icp.parquet", [row("can", 0, "icp", 5, diversity=3.0) | about])
-    write_table(trial / "svgd.parquet", [row("can", 0, "svgd", 5, diversity=4.0) | about])
-    failed = row("can", 0, "icp", None) | about | {"status": "failed: once"}
-    write_table(trial / "icp.failed.parquet", [failed])  # before it went well
-    found = open_evaluation(tmp_path).rows[["method", "diversity"]].to_numpy().tolist()
-    assert found == [["icp", 3.0], ["svgd", 4.0]]
-
-
-@pytest.mark.parametrize("rows", [[], [row("a@#$|<b>", 0, "own *$_", 4, seconds=0.0)]])
-def test_there_is_a_report_on_little(tmp_path, rows):
-    done = run(report.main, str(write_evaluation(tmp_path, rows, name="<$own_$>")))
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "<h1>Evaluation &lt;$own_$&gt;</h1>" in (tmp_path / "report/report.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import importlib
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -68,18 +67,6 @@ def test_help_of_replay_waits_for_no_heavy_import(verb, tmp_path):
     assert "usage: replay" in done.stdout
 
 
-HELPED = """
-from replay.startup import begin
-
-if __name__ == "__main__":
-    begin()
-    from multiprocessing import get_context
-
-    worker = get_context("spawn").Process(target=print)
-    worker.start()
-    worker.join()
-    assert worker.exitcode == 0
-"""
 REGISTERED = """
 import sys
 import numpy as np
@@ -135,28 +122,6 @@ def test_ctrl_c_during_imports_ends_a_command_quietly(words, module, tmp_path):
     assert done.stderr == ""
 
 
-@pytest.mark.skipif(os.name == "nt", reason="there are no such signals on Windows")
-def test_ctrl_c_stays_ignored_where_it_was(tmp_path):
-    code = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
-    code += INTERRUPTED.format(module="numba")
-    done = ran(["replay", "verify", "x.mcap"], tmp_path, code)
-    assert done.returncode == 2
-    assert "x.mcap does not exist" in done.stderr
-
-
-def test_processes_of_a_console_script_import_nothing_from_the_current_folder(tmp_path):
-    """Such as Dask's."""
-    script, folder = tmp_path / "bin" / "chsel-probe", tmp_path / "here"
-    script.parent.mkdir()
-    folder.mkdir()
-    script.write_text(HELPED)
-    for name in ("numba", "multiprocessing"):
-        (folder / f"{name}.py").write_text(f"open('{name} was executed', 'w')\n")
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    subprocess.run([sys.executable, script], cwd=folder, env=environment, check=True)
-    assert sorted(path.name for path in folder.iterdir()) == ["multiprocessing.py", "numba.py"]
-
-
 def test_the_published_package_in_our_place_is_named(tmp_path):
     """As pip leaves it, or as it shadows an editable installation."""
     theirs = tmp_path / "chsel"
@@ -167,14 +132,3 @@ def test_the_published_package_in_our_place_is_named(tmp_path):
         done = ran(words, tmp_path, "")
         assert (done.returncode, done.stdout) == (2, "")
         assert done.stderr == f"error: {WRONG_PACKAGE.format(theirs)}\n"
-
-
-def test_files_of_the_published_package_among_ours_are_named(tmp_path):
-    shutil.copytree(REPOSITORY / "chsel", tmp_path / "chsel")
-    (tmp_path / "chsel" / "wrapper.py").touch()
-    done = ran(["replay", "info", "x.mcap"], tmp_path, "")
-    told = WRONG_PACKAGE.format(tmp_path / "chsel")
-    assert (done.returncode, done.stderr) == (2, f"error: {told}\n")
-    code = "try:\n    import chsel\nexcept ImportError as error:\n    print(error)"
-    (tmp_path / "library.py").write_text(code)
-    assert ran(["library"], tmp_path, "").stdout == f"{told}\n"

@@ -6,7 +6,6 @@ import pytest
 
 from runners import report
 from runners.reporting.evaluation_folder import open_evaluation
-from runners.reporting.sections import sections_of
 from runners.reporting.statistics import (
     LEAST_ERROR,
     bootstrap_interval,
@@ -154,16 +153,3 @@ def test_a_report_is_written_and_a_baseline_without_sessions_is_an_error(tmp_pat
         2,
         "error: baseline icp has no session; accepted: information, grid",
     )
-
-
-@pytest.mark.parametrize("kept", [0, 1, 4])
-def test_there_is_a_report_on_sessions_that_have_hardly_begun(tmp_path, rows, kept):
-    write_sessions(tmp_path, rows[:kept], BUDGETS)
-    first, *others = sections_of(open_evaluation(tmp_path))
-    there = [(line[0], line[1], *line[4:]) for line in first.tables[0].rows]
-    if kept == 0:
-        assert there == [("grid", "0 of 0"), ("information", "0 of 0")]
-        assert others == []
-    else:  # of the one that has begun
-        assert there == [("grid", "0 of 1", "0"), ("information", "1 of 1", str(kept))]
-        assert "Policies compared, session by session" not in {one.title for one in others}

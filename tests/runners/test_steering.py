@@ -1,20 +1,18 @@
 """Sessions whose probes a policy chooses, as a user runs them."""
 
 import json
-from typing import Any
 
 import numpy as np
 import pytest
 
 from chsel.events import Decided, Probe
 from chsel.policies.steering import Steering
-from replay.mcap.reader import Recording, read_recording
+from replay.mcap.reader import read_recording
 from runners import probe
-from tests.runners.in_process import Done, run
+from tests.runners.in_process import run
 
 SESSION = ("object=spam_can", "session=kinematic", "method=anchored", "method.size=small")
 SESSION += ("recording=mcap",)
-Found = tuple[Done, Recording, dict[str, Any]]
 
 
 def steered(logs, *overrides):

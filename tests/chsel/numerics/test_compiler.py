@@ -4,20 +4,13 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 
 import pytest
 
 from chsel.errors import SettingError
 from chsel.numerics import compiler
-from chsel.numerics.compiler import compiled, implements
 from tests.chsel.samples import REPOSITORY as ROOT
 
-COMPUTE = """
-import numpy as np
-from chsel.numerics.elementary import sines_cosines
-print(np.stack(sines_cosines(np.linspace(-9.0, 9.0, 50))).tobytes().hex())
-"""
 PLANTED = {
     "constant.py": "STEP = 1.0\n",
     "far.py": """
@@ -82,23 +75,6 @@ def test_a_kernel_is_compiled_again_if_anything_that_it_contains_has_changed(tmp
     assert near(NEAR) == [0.0, 0.0]
 
 
-@pytest.mark.slow
-def test_two_processes_compile_at_once_and_a_third_nothing(tmp_path):
-    folder = tmp_path / "kept"
-    names = {"CHSEL_CACHE_DIR": str(folder), "OMP_NUM_THREADS": "1"}
-    processes = [start(COMPUTE, **names) for _ in range(2)]
-    (one, errors), (other, others_errors) = map(result_of, processes)
-    assert one == other == result_of(start(COMPUTE))[0]
-    notice = "compiling the kernels of this version, once: up to a minute"
-    notice = f"{notice} (kept in {folder})\n"
-    assert notice in {errors, others_errors} <= {notice, ""}  # one may have come late
-    kept = {file: file.stat().st_mtime_ns for file in folder.rglob("*.nb?")}
-    assert len(kept) > 2
-    assert result_of(start(COMPUTE, **names)) == (one, "")
-    assert {file: file.stat().st_mtime_ns for file in folder.rglob("*.nb?")} == kept
-    assert {each.stat().st_mode & 0o777 for each in (folder, *folder.iterdir())} == {0o700}
-
-
 def test_a_folder_that_others_can_write_to_is_refused(tmp_path, monkeypatch):
     named = tmp_path / "open" / "named"
     named.mkdir(parents=True, mode=0o700)
@@ -125,38 +101,3 @@ def test_a_folder_that_others_can_write_to_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("CHSEL_CACHE_DIR", str(ROOT / "README.md"))
     with pytest.raises(SettingError, match="which cannot be written; accepted: a folder for"):
         directory()
-
-
-def test_without_a_home_that_can_be_written_kernels_go_to_a_temporary_folder(tmp_path, monkeypatch):
-    """A file in place of the home folder: as root, permissions would not hold anybody back."""
-    monkeypatch.delenv("CHSEL_CACHE_DIR", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr(compiler.tempfile, "tempdir", str(tmp_path))
-    directory = compiler.cache_directory.__wrapped__
-    assert directory().parent == tmp_path / "home" / "chsel" / "kernels"
-    shutil.rmtree(tmp_path / "home")
-    (tmp_path / "home").write_text("no folder")
-    assert directory().parent == tmp_path / f"chsel-{os.getuid()}"
-
-
-def test_folders_that_were_not_used_for_longest_are_removed(tmp_path):
-    folders = [tmp_path / f"{number:020x}" for number in range(11)]
-    for age, folder in enumerate(folders):
-        folder.mkdir()
-        os.utime(folder, (time.time() - 1000.0 * age,) * 2)
-    (tmp_path / "notes").mkdir()
-    compiler._prune(folders[-1])
-    kept = {*folders[: compiler.KEPT_FOLDERS - 1], folders[-1], tmp_path / "notes"}
-    assert set(tmp_path.iterdir()) == kept
-
-
-def _twice(x):
-    return 2.0 * x
-
-
-def test_functions_of_other_packages_are_not_kept():
-    kernel = compiled(_twice)
-    assert kernel(2.0) == 4.0
-    assert kernel.stats.cache_path is None
-    with pytest.raises(TypeError, match=r"test_compiler\._twice is not in chsel; accepted: func"):
-        implements(_twice, tuple)(_twice)

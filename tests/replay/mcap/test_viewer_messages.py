@@ -3,27 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-from pathlib import Path
 
 import numpy as np
-import pytest
-import trimesh
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 
-import replay
 from chsel.events import Decided, HypothesesFound, Probe
 from chsel.problem.poses import inverse, rotation_matrices
-from replay.mcap.foxglove_messages import FOXGLOVE, POINT_CLASSES, VIEWS
-from replay.mcap.schemas import MESSAGES, RECORDS, STEP_TIME
-from replay.mcap.viewer_messages import CumulativePoints, next_probe, simple_mesh
+from replay.mcap.foxglove_messages import POINT_CLASSES, VIEWS
+from replay.mcap.schemas import STEP_TIME
+from replay.mcap.viewer_messages import next_probe
 from tests.replay.conftest import example_events, nth
-
-LAYOUT = Path(replay.__file__).parent / "foxglove_layout.json"
 
 
 def messages(path, *topics):
@@ -92,29 +85,6 @@ def test_the_last_clouds_of_all_topics_hold_all_points_known_at_that_time(write)
             assert shown.tobytes() == getattr(known, kind).astype("<f4").tobytes()
 
 
-def test_all_points_of_a_long_session_are_written_a_few_times_each():
-    cumulative = CumulativePoints()
-    shown: dict[int, np.ndarray] = {}
-    written, steps = 0, 4000
-    for step in range(steps):
-        changed = cumulative.add(np.full((1, 3), float(step)))
-        shown |= changed
-        written += sum(map(len, changed.values()))
-    newest_last = np.concatenate([shown[level] for level in sorted(shown, reverse=True)])
-    assert newest_last[:, 0].tolist() == list(range(steps))
-    assert written < 17 * steps  # all of them at each step: 2000 times each
-
-
-@pytest.mark.parametrize("subdivisions", [1, 4])
-def test_a_simple_mesh_has_few_faces_and_the_same_shape(subdivisions):
-    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.1)
-    vertices, faces = simple_mesh(ball)
-    assert len(faces) <= min(400, len(ball.faces))
-    found = trimesh.Trimesh(vertices, faces, process=False)
-    assert np.linalg.norm(found.vertices, axis=1).min() > 0.09
-    assert found.volume == pytest.approx(ball.volume, rel=0.1)  # faces still point outwards
-
-
 def test_the_next_probe_is_an_arrow_from_start_to_end(steered_events):
     first, last = (nth(steered_events, Decided, number) for number in (0, -1))
     (entity,) = SceneUpdate.FromString(next_probe(first, 5)).entities
@@ -139,13 +109,3 @@ def test_poses_and_the_true_pose_are_there_to_the_bit(events, write):
     truth = FrameTransform.FromString(messages(path, "/object_pose")[0][2])
     assert (truth.parent_frame_id, truth.child_frame_id) == ("world", "object")
     assert truth.translation.y == events[0].world_from_object[1, 3]
-
-
-def test_the_layout_for_foxglove_shows_topics_and_fields_that_recordings_have():
-    panels = json.loads(LAYOUT.read_text())["configById"]
-    assert set(panels["3D!scene"]["topics"]) == set(FOXGLOVE) - {"/log", "/object_pose"}
-    assert panels["RosOut!log"]["topicToRender"] == "/log"
-    plots = [panel for name, panel in panels.items() if name.startswith("Plot!")]
-    for value in (path["value"] for panel in plots for path in panel["paths"]):
-        topic, field = value.split(".")[:2]
-        assert field.split("[")[0] in MESSAGES[RECORDS[topic]]

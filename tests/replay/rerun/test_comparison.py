@@ -4,16 +4,14 @@ import numpy as np
 import pytest
 
 from chsel.cost.compiled_cost import CompiledCost
-from chsel.errors import RecordingError
 from chsel.problem.poses import compose, inverse
 from chsel.problem.registration_problem import Hypotheses
-from chsel.problem.trust import trust_in
-from replay.comparing.comparison import common_cost, numbers_under
+from replay.comparing.comparison import common_cost
 from replay.mcap.reader import read_recording
 from replay.rerun.comparison_view import ranked, save_comparison
 from tests.replay.conftest import example_events
 from tests.replay.rerun.test_recorder import shown_poses
-from tests.tools.rrd_rows import read, shown_at
+from tests.tools.rrd_rows import read
 
 pytestmark = pytest.mark.filterwarnings("ignore:no node of the SDF is deeper")  # a thin box
 
@@ -65,27 +63,6 @@ def test_hypotheses_stand_at_their_poses_with_the_costs_of_one_judge(saved, reco
             np.testing.assert_allclose(shown[cost], pose, atol=1e-6)
 
 
-def test_curves_are_the_numbers_of_the_table(saved, recording, results):
-    rows = read(saved)
-    for step in (1, 2):
-        judge = judge_of(recording, step)
-        numbers = numbers_under(judge, results["chsel"][step], recording.start)
-        spread = trust_in(recording.problem(step), results["chsel"][step]).spread
-        expected = {
-            "log10_best_cost": np.log10(numbers["best_cost"]),
-            "log10_median_cost": np.log10(numbers["median_cost"]),
-            "best_position_error": 1e3 * numbers["best_position_error"],
-            "best_rotation_error": np.rad2deg(numbers["best_rotation_error"]),
-            "closest_position_error": 1e3 * numbers["closest_position_error"],
-            "closest_rotation_error": np.rad2deg(numbers["closest_rotation_error"]),
-            "spread": 1e3 * spread,
-        }
-        for curve, value in expected.items():
-            shown = shown_at(rows[f"/curves/{curve}/0"], step)
-            assert shown["Scalars:scalars"] == [pytest.approx(value, rel=1e-9)]
-            assert shown["SeriesLines:names"] == ["chsel"]
-
-
 def test_ranking_sorts_all_that_belongs_to_a_hypothesis(recording):
     found, judge = recording.hypotheses(1), judge_of(recording, 1)
     again = ranked(found, judge)
@@ -95,17 +72,3 @@ def test_ranking_sorts_all_that_belongs_to_a_hypothesis(recording):
     for name in ("object_from_world", "duplicate", "cell"):
         np.testing.assert_array_equal(getattr(again, name), getattr(found, name)[order])
     assert order.tolist() != list(range(len(order)))
-
-
-def test_mistakes_are_named_and_leave_nothing(recording, tmp_path):
-    path = tmp_path / "a.rrd"
-    found = recording.hypotheses(1)
-    with pytest.raises(RecordingError, match="no result to compare; accepted: at least one"):
-        save_comparison(path, recording, {"chsel": {}})
-    with pytest.raises(RecordingError, match=r"cannot be written .*accepted: a new \.rrd"):
-        save_comparison(tmp_path / "no folder" / "a.rrd", recording, {"chsel": {1: found}})
-    assert not path.exists()
-    path.write_bytes(b"mine")
-    with pytest.raises(RecordingError, match=r"a\.rrd cannot be written \(File exists"):
-        save_comparison(path, recording, {"chsel": {1: found}})
-    assert path.read_bytes() == b"mine"

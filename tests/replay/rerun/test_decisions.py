@@ -73,18 +73,6 @@ def rows(tmp_path_factory):
     return read(write(tmp_path_factory.mktemp("rerun") / "a.rrd", session()))
 
 
-def test_every_action_is_an_arrow_along_its_way_no_longer_than_it(rows):
-    shown = shown_at(rows["/scene/actions/offered"], -1)
-    starts = ACTIONS.world_from_hand[:, :3, 3]
-    np.testing.assert_allclose(shown["Arrows3D:origins"], starts, rtol=1e-6)
-    vectors = np.array(shown["Arrows3D:vectors"])
-    lengths = np.linalg.norm(vectors, axis=1)
-    np.testing.assert_allclose(vectors / lengths[:, None], [[0, 0, 1], [0, 0, 1], [1, 0, 0]])
-    assert lengths[1] == pytest.approx(0.02, rel=1e-6)
-    assert lengths[0] == pytest.approx(lengths[2])
-    assert 0.02 < lengths[0] < 0.2
-
-
 @pytest.mark.parametrize(("step", "chosen"), [(-1, 0), (0, 2), (1, None)])
 def test_the_next_probe_and_its_forecast_stand_at_the_step_before_it(rows, step, chosen):
     way = shown_at(rows["/scene/actions/chosen"], step)

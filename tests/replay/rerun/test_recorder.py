@@ -30,7 +30,6 @@ from replay.colors import CostScale
 from replay.rerun import viewer as rerun_viewer
 from replay.rerun.rerun_recorder import RerunRecorder
 from replay.rerun.scene import LEVELS, cost_levels
-from replay.rerun.sensors import display_size
 from tests.tools.rrd_rows import at_probe, read, shown_at
 
 WORKSPACE = Workspace((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
@@ -238,27 +237,6 @@ def test_of_cells_over_a_third_measure_the_lowest_cost_is_shown(tmp_path):
     assert costs[1, 0] == 3.0
 
 
-def test_hypotheses_are_marked_in_their_cells(rows):
-    marks = at_probe(rows["/archive/hypotheses"], 0)[-1]
-    np.testing.assert_allclose(  # cells 0, 1, 3, 4, 5 of 4 x 3, y down
-        marks["Points2D:positions"], [(0.5, 2.5), (0.5, 1.5), (1.5, 2.5), (1.5, 1.5), (1.5, 0.5)]
-    )
-    assert marks["Points2D:labels"][:2] == ["cost 1.5", "cost 6"]
-
-
-def test_iterations_run_on_over_images_stages_and_registrations(rows):
-    drawn = [times for times, values in rows["/archive/cost"] if "Image:buffer" in values]
-    times = [(times["probe"], times["iteration"]) for times in drawn]
-    assert times == [(0, 56), (0, 61), (1, 117), (1, 122), (2, 175), (2, 180)]
-    series = [
-        (times, values["Scalars:scalars"][0])
-        for times, values in rows["/search/highest"]
-        if "Scalars:scalars" in values
-    ]
-    assert [set(times) for times, _ in series] == [{"iteration"}] * 12
-    assert [value for _, value in series[:5]] == [900.0, 90.0, 2.0, 2.0, 900.0]
-
-
 def test_numbers_of_a_step_stand_at_its_probe(rows):
     for entity, expected in {
         "/cost/lowest": [1.5] * 3,
@@ -301,25 +279,6 @@ def test_a_camera_stands_at_its_pose_and_sees_what_it_measured(rows):
     (buffer,) = seen["DepthImage:buffer"]
     assert bytes(buffer) == depth(1).values.tobytes()
     assert seen["DepthImage:meter"] == [500.0]  # of the last image, of 2 mm a unit
-
-
-def test_each_image_has_its_moment_and_a_probe_shows_the_largest_contact(rows):
-    drawn = [
-        (times["iteration"], list(buffer).count(0))
-        for times, values in rows["/sensors/pad_1/pixels"]
-        for buffer in values.get("SegmentationImage:buffer", ())
-        if times["probe"] == 0
-    ]
-    assert drawn == [(3, 1), (4, 7), (5, 4), (5, 7)]  # after the two of the camera
-
-
-def test_large_images_are_thinned_out_for_the_eye():
-    large = depth(0, height=5, width=1000)
-    small = display_size(large)
-    assert small.values.tolist() == large.values[::4, ::4].tolist()
-    assert small.mask.tolist() == large.mask[::4, ::4].tolist()
-    assert small.intrinsics.tolist() == [2.0, 2.25, 0.625, 0.375]
-    assert display_size(depth(0)).values.shape == (4, 6)
 
 
 def test_without_a_viewer_the_live_view_is_a_warning(tmp_path, monkeypatch):

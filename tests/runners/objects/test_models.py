@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import tarfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -103,7 +102,6 @@ def open_box():
 
 
 BOX = archive(trimesh.creation.box((0.1, 0.2, 0.3)))
-Serve = Callable[[bytes], AssetsConfig]
 
 
 @pytest.fixture
@@ -144,8 +142,3 @@ def test_what_is_not_the_scan_leaves_nothing(serve, content, reason):
     with pytest.raises(DownloadError, match=rf"_google_16k\.tgz is not the archive .*{reason}"):
         download_scan(SCAN, assets)
     assert list(assets.folder.iterdir()) == []
-
-
-def test_no_server_at_all_is_reported(tmp_path):
-    with pytest.raises(DownloadError, match=r"refused.*; try again"):
-        download_scan(SCAN, AssetsConfig(str(tmp_path), "http://127.0.0.1:1"))

@@ -7,7 +7,7 @@ import yaml
 from PIL import Image
 
 import chsel
-from chsel.errors import SessionError, SettingError
+from chsel.errors import SessionError
 from chsel.problem.mesh import load_mesh
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
@@ -210,23 +210,6 @@ def test_one_point_a_voxel_is_kept_the_one_nearest_its_centre():
     points = np.array([[0.004, 0, 0], [0.011, 0, 0], [0.001, 0.001, 0], [0.01, 0, 0]])
     np.testing.assert_array_equal(one_per_voxel(points, 0.01), points[[2, 3]])
     assert one_per_voxel(np.zeros((0, 3)), 0.01).shape == (0, 3)
-
-
-def test_frames_and_rigs_that_do_not_fit_are_refused(tmp_path):
-    frame = read_depth_frame(written(tmp_path))
-    without = dataclasses.replace(frame, label=None)
-    with pytest.raises(SettingError, match=r"workspace is missing.*accepted: \[\[x0"):
-        points_of(without)
-    with pytest.raises(SettingError, match="rig depth_frame has 0 cameras; accepted: 1"):
-        depth_frame_points(frame, dataclasses.replace(rig(), cameras=()), free_resolution=0.01)
-    tiny = dataclasses.replace(frame, depth=frame.depth * 0.001)
-    with pytest.raises(SessionError, match=r"median is 0\.0009 m: check depth_scale"):
-        points_of(tiny)
-    assert frame.label is not None
-    dots = np.zeros_like(frame.label)
-    dots[25, 35:37] = True
-    with pytest.raises(SessionError, match="none of the 2 pixels of label is of the surface"):
-        points_of(dataclasses.replace(frame, label=dots))
 
 
 def real_frame(folder, name):

@@ -1,23 +1,15 @@
 """What sensors measured of something else, or wrongly, does not become points of the object."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
-from PIL import Image
 
-from chsel.events import Logged
-from replay.mcap.reader import read_recording
-from runners.probe import main
 from runners.sensors.rig import CloudRig, GateRig, Rig
 from runners.simulated_robot.log_writer import transform
-from tests.runners.in_process import run
 from tests.runners.sensors import sphere_log
 from tests.runners.sensors.small_logs import BEGIN, read, ros2_cloud, write_ros2
 from tests.runners.sensors.sphere_log import CENTRE, MEMBRANE, RADIUS, RIG, SphereLog, heights
-from tests.runners.sensors.test_depth_frame import scene, written
 
 PLAIN_MEMBRANE = sphere_log.membrane
 WITHOUT = GateRig(jump=1e6, part=0.0, speckle=0)
@@ -113,25 +105,3 @@ def test_ends_of_rays_that_are_too_far_away_give_no_free_space(tmp_path):
     _, (near,), _ = read(cloud_log(tmp_path / "near.mcap", ends[:1]), cloud_rig("rays"))
     assert len(near.new_points.free) > 0
     np.testing.assert_array_equal(probe.new_points.free, near.new_points.free)
-
-
-def test_counts_stand_in_the_table_the_recording_and_the_summary(tmp_path):
-    path = written(tmp_path)
-    depth = scene()[0]
-    depth[22:38, 30:45] = 520 + 40 * (np.indices((16, 15)).sum(axis=0) % 2)  # of no surface
-    Image.fromarray(depth).save(tmp_path / "depth.png")
-    trimesh.creation.box((0.15, 0.1, 0.05)).export(tmp_path / "box.ply")
-    frame = ["session=sensors", f"session.path={path}", "session/rig=depth_frame"]
-    frame += ["session.rig.cameras.0.edge=null", "session.object_resolution=0.02"]
-    box = ["object=mesh", f"object.path={tmp_path / 'box.ply'}", "method=icp"]
-    done = run(main, *frame, *box, "recording=mcap", f"logs={tmp_path / 'logs'}")
-    assert done.returncode == 0, done.stderr
-    (folder,) = (tmp_path / "logs" / "probe").iterdir()
-    counts = json.loads((folder / "summary.json").read_text())["sensors"]["camera"]
-    assert (counts["images"], counts["far"], counts["outline"]) == (1, 0, 600 - 16 * 26)
-    assert counts["small"] == 16 * 13 - 8  # but for those beside the front that are near it
-    recorded = read_recording(folder / "recording.mcap").events(images=False)
-    told = [event.text for event in recorded if isinstance(event, Logged)]
-    label = next(text for text in told if text.startswith("label: "))
-    assert label.endswith("184 at the label's outline, 200 in regions too small")
-    assert any("33 % of the label's pixels are left out" in text for text in told)

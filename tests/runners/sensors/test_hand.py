@@ -1,5 +1,3 @@
-import sys
-
 import numpy as np
 import pytest
 import trimesh
@@ -119,13 +117,6 @@ def test_meshes_are_found_beside_the_urdf_and_in_its_packages(tmp_path):
     (solid,) = model.parts()
     assert (solid.is_watertight, solid.volume) == (True, pytest.approx(1e-3))
     assert "a mesh of link a is open; its convex hull is used" in "".join(model.warnings)
-
-
-def test_without_yourdfpy_boxes_work_and_a_urdf_names_the_extra(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "yourdfpy", None)
-    assert HandModel(HandRig(frame="hand", boxes=(BoxRig((0.1, 0.1, 0.1)),))).solids() is not None
-    with pytest.raises(SettingError, match=r"pip install -e '\.\[sensors\]'"):
-        HandModel(hand(urdf(tmp_path)))
 
 
 @pytest.mark.parametrize(

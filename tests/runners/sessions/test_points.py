@@ -3,7 +3,6 @@ import pytest
 import trimesh
 
 from chsel.errors import PointsError, SettingError
-from chsel.numerics.arrays import read_npz
 from chsel.problem.sdf_grid import object_grid
 from runners.objects.loader import ObjectModel
 from runners.sessions.points import PointsSession, PointsSettings, read_points
@@ -111,40 +110,6 @@ def test_vertices_beside_the_faces_are_points_too(tmp_path):
 def test_malformed_arrays_are_named(tmp_path, arrays, message):
     with pytest.raises(PointsError, match=rf"points.npz.*{message}"):
         read_points(npz(tmp_path, **arrays))
-
-
-def test_arrays_larger_than_the_limit_are_refused_before_they_are_unpacked(tmp_path):
-    path = tmp_path / "points.npz"
-    np.savez_compressed(path, free=np.zeros((100_000, 3)))
-    assert path.stat().st_size < 20_000
-    with pytest.raises(PointsError, match=r"have 2 MiB unpacked; accepted: at most 1 MiB"):
-        read_npz(path, most_bytes=2**20, error=PointsError)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("x,y,z\n0,0,0\n", "its columns are x, y, z; accepted: x, y, z, kind"),
-        ("x,y,z,kind,colour\n0,0,0,free,red\n", "its columns are"),
-        ("x,y,z,kind,kind\n0,0,0,free,free\n", "its columns are"),
-        ("x,y,z,kind\n0,0,0,solid\n", "row 1: kind is none of surface, free"),
-        ("x,y,z,kind\n0,0,0,free\n0,b,0,free\n", "could not convert .*'b'; accepted: numbers"),
-        ("x,y,z,kind\n0,0,inf,free\n", "row 1: one of x, y"),
-        ("x,y,z,kind\n0,0\n", "row 1: kind is none of"),
-        ("x,y,z,kind\n0,0,0,free,1\n", "not a readable .csv file"),
-        ("x,y,z,kind\n0,0,0,free\n0,0,0,free,1\n", "not a readable .csv file"),
-        ("x,y,z,kind,sdf\n0,0,0,known,\n", "row 1: a known point needs an sdf"),
-        ("x,y,z,kind,sdf\n0,0,0,free,0.1\n", "row 1: a point that is not known has an sdf"),
-        ("x,y,z,kind,step\n0,0,0,free,1.5\n", "row 1: step is not an integer"),
-        ("x,y,z,kind,step\n0,0,0,free,4294967296\n", "steps are .*; accepted: 0 to 4294967295"),
-        ("x,y,z,kind,step\n0,0,0,free,-1\n", "steps are from -1"),
-        ("x,y,z,kind\n", "holds no points"),
-        ("", "not a readable .csv file"),
-    ],
-)
-def test_malformed_rows_are_named(tmp_path, content, message):
-    with pytest.raises(PointsError, match=rf"points.csv.*{message}"):
-        read_points(text(tmp_path, content))
 
 
 def test_files_that_are_not_what_their_suffix_says_are_refused(tmp_path):

@@ -243,18 +243,6 @@ def test_clouds_are_rays_or_surface_or_contacts(tmp_path):
     assert "/lidar" not in lines(events)
 
 
-@pytest.mark.parametrize("role", ["surface", "contacts", "rays"])
-def test_a_topic_whose_points_are_all_out_of_reach_is_a_warning(tmp_path, role):
-    """Here, as they are in millimetres."""
-    cloud = ((200.0, 0.0, 0.0), (200.0, 0.0, 1.0), (np.nan, 0.0, 0.0))
-    log = SphereLog(cloud=cloud).write(tmp_path / "log.mcap")
-    told = lines(open_log(log, replace(RIG, clouds=(CloudRig("/skin", role),))).probes())
-    count = 2 if role == "contacts" else 4  # of which the second message is between probes
-    reach = "over 100 m away" if role == "rays" else "out of the workspace"
-    around = "in the first message around [200.7, 0.1, 1.05] m"
-    assert f"/skin: all {count} points are {reach}, {around}" in told
-
-
 WRONG = {
     "topic": {"cameras": (replace(RIG.cameras[0], depth="/probe"),)},
     "unit": {"bubbles": (replace(RIG.bubbles[0], unit=0.001),)},  # the pad's are in metres
@@ -286,19 +274,6 @@ def test_a_log_that_lacks_something_says_so(tmp_path, written, changes, message)
     log = SphereLog(**written).write(tmp_path / "log.mcap")
     with pytest.raises((SessionError, SettingError), match=message):
         open_log(log, replace(RIG, **changes))
-
-
-def test_a_hole_in_the_transforms_costs_the_images_within(tmp_path):
-    log = SphereLog(lost_transforms=(3.4, 4.6)).write(tmp_path / "log.mcap")
-    session = open_log(log)
-    events = list(session.probes())
-    first, second = probes(events)
-    assert (len(first.contacts), second.outcome) == (50, "free")
-    assert [session.report.by_probe[step]["pad"].lost for step in (0, 1)] == [0, 12]
-    assert "pad: left out, as the pose of pad_frame is not known then (12 times)" in lines(events)
-    # Nothing is swept across the hole.
-    steps = np.abs(np.diff(second.gripper_path[:, 0, 3]))
-    assert steps.max() > 0.02 or len(second.gripper_path) < 20
 
 
 def test_a_camera_whose_clock_is_ahead_is_put_right(tmp_path, events):

@@ -1,6 +1,5 @@
 """The simulated robot's world: scene, membranes and noise."""
 
-import sys
 from contextlib import closing
 
 import numpy as np
@@ -104,12 +103,6 @@ def test_objects_stand_on_the_shelf_within_the_workspace(name):
     assert np.allclose(pose[:3, 2], [0.0, 0.0, 1.0], atol=0.02)  # upright
     with pytest.raises(SessionError, match="more than the cabinet has"):
         stood_on_shelf(mesh.apply_scale(2.5), configuration)
-
-
-def test_a_missing_engine_is_said(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(SessionError, match="PyBullet is not installed"):
-        PhysicsScene(MESH, POSE)
 
 
 CAMERA = BubbleSettings().pinhole

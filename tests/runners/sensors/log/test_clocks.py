@@ -108,16 +108,3 @@ def test_states_that_are_sent_all_the_time_say_nothing_new(texts, steps):
     assert ([step for step, *_ in found], said) == (steps, [])
     if steps[1] == 1 and texts[0] == "0":
         assert found == [(0, 0, 10, 30, 30), (1, 30, 30, 40, 101)]
-
-
-def test_marks_that_do_not_fit_are_reported():
-    found, said = spans("end 9", "begin 2", "hello", "begin 2", "begin 1")
-    assert found == [(0, 0, 20, 50, 50), (1, 50, 50, 100, 101)]
-    assert said == [
-        "the marker 'end 9' does not follow a begin",
-        "a marker is 'hello'; accepted: begin N, end",
-        "the marker 'begin 1' does not follow an end",
-        "the last probe has a begin and no end; the log's end ends it",
-        "probes are marked 2, 1; as these do not rise, they are counted from 0 to 1",
-    ]
-    assert [step for step, *_ in spans("begin", "begin", "end")[0]] == [0, 1]

@@ -7,8 +7,6 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from mcap.writer import Writer as McapWriter
-from mcap_ros2.writer import Writer
 
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.log.decoding import packed_points
@@ -23,8 +21,7 @@ from runners.sensors.log.messages import (
     WrenchMessage,
 )
 from runners.sensors.log.raw_log import RawLog
-from runners.sensors.log.ros2_definitions import full_definition
-from runners.simulated_robot.log_writer import image, joint_state
+from runners.simulated_robot.log_writer import image
 from tests.runners.sensors.foxglove_log import in_foxgloves_messages
 from tests.runners.sensors.small_logs import (
     BEGIN,
@@ -124,45 +121,6 @@ def test_broken_messages_are_counted_with_their_topic(tmp_path):
     said = " ".join(log.faults)
     assert "'rgb8' is no depth" in said
     assert "a force or torque is not finite" in said
-
-
-def test_unknown_schemas_and_fields_are_faults(tmp_path):
-    data = b"\0\1\0\0\4\0\0\0end\0"
-    with (tmp_path / "log.mcap").open("wb") as file:
-        writer = McapWriter(file)
-        writer.start()
-        for topic, name, encoding, definition in (
-            ("/own", "my_msgs/msg/Own", "cdr", b"float64[999999999] x"),
-            ("/image", "sensor_msgs/msg/Image", "cdr", b"Image[] nested # of itself"),
-            ("/json", "foxglove.RawImage", "json", b"{}"),
-            ("/string", "std_msgs/msg/String", "cdr", b"string data # as usual"),
-        ):
-            schema = writer.register_schema(name, "ros2msg", definition)
-            writer.add_message(writer.register_channel(topic, encoding, schema), 1, data, 1)
-        writer.finish()
-    log = RawLog(tmp_path / "log.mcap")
-    assert [received.content for received in log.messages(log.topics)] == ["end"]
-    reasons = dict(text.split(": ", 1) for text in log.faults)
-    assert reasons["/own"] == "messages my_msgs/msg/Own as cdr are not read"
-    assert reasons["/json"] == "messages foxglove.RawImage as json are not read"
-    assert "sensor_msgs/msg/Image" in reasons["/image"]
-    assert len(reasons) == 3
-
-
-def test_messages_with_further_fields_are_read(tmp_path):
-    text = full_definition("sensor_msgs/JointState")
-    own, _, parts = text.partition("=")
-    own = f"# A comment; with uint8 in it\nint32 MOST=7\nuint16 sequence\n{own}Own[] more\n"
-    text = f"{own}={parts}{'=' * 80}\nMSG: sensor_msgs/Own\nstring source\n"
-    message = {"sequence": 7, **joint_state(["elbow"], [0.5], 0), "more": [{"source": "arm"}]}
-    with (tmp_path / "log.mcap").open("wb") as file:
-        writer = Writer(file)
-        schema = writer.register_msgdef("sensor_msgs/msg/JointState", text)
-        writer.write_message("/joints", schema, message, BEGIN)
-        writer.finish()
-    received = by_topic(tmp_path / "log.mcap")["/joints"]
-    assert received.content == {"elbow": 0.5}
-    assert (received.stamp, received.log_time) == (None, BEGIN)  # a stamp of 0 is none
 
 
 def test_intrinsics_are_those_of_the_pixels_that_are_sent(tmp_path):
