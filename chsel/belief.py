@@ -72,6 +72,12 @@ class Mode:
     covariance: FloatArray
     members: IntArray  # indices of poses
 
+    @property
+    def deviations(self) -> tuple[float, float]:
+        """Root mean squares of how far members are off: of the centre, metres, and radians."""
+        squares = np.diagonal(self.covariance)
+        return float(np.sqrt(squares[:3].sum())), float(np.sqrt(squares[3:].sum()))
+
 
 @dataclass(frozen=True)
 class Gripper(CheckedSettings):
@@ -207,7 +213,7 @@ class PoseBelief:
     def __repr__(self) -> str:
         lines = [f"<PoseBelief: {len(self)} poses, {self.trust}"]
         for mode in self.modes[:3]:
-            size = 1000.0 * float(np.sqrt(np.trace(mode.covariance[:3, :3])))
+            size = 1000.0 * mode.deviations[0]
             x, y, z = inverse(mode.object_from_world)[:3, 3]
             place = f"at [{x:.3f}, {y:.3f}, {z:.3f}] m, centre within {size:.1f} mm"
             lines.append(f"mode {mode.number}: {100.0 * mode.weight:.0f} %, {place}")

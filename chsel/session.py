@@ -103,7 +103,8 @@ class Session:
 
     step: of the last points that were added, -1 before. warnings: so far, each kind once. answer:
     the last result, None before. trust: in it. stop: why `next_probe` gave None, "" if it did not.
-    grasp: the world_from_gripper (4, 4) that works with the largest chance, None before.
+    grasp, grasp_chance: the world_from_gripper (4, 4) that works with the largest chance, None
+        before, and this chance.
     failure: why the last step has no result, "" if nothing failed. registered, problem: of the last
     step, None without a registration. seconds: by stage, of the last step. steering: of the next
     probe, None before there are actions. online: which problem follows, and all known points.
@@ -237,6 +238,7 @@ class Session:
         self.answer: Hypotheses | None = None
         self.trust: Trust | None = None
         self.grasp: FloatArray | None = None  # (4, 4), the best of the last ones
+        self.grasp_chance = 0.0
         self.seconds: dict[str, float] = {}
         self._belief: PoseBelief | None = None  # of the result `_believed`
         self._believed: Hypotheses | None = None
@@ -476,14 +478,9 @@ class Session:
             return None
         if self._decided == self.step:
             raise SettingError("a probe was chosen before; accepted: `add` its outcome first")
-        if grasps is not None and self.answer is not None and self.trust is not None:
-            self.grasp, chance = self.belief.best_grasp(*grasps, gripper)
-            if chance >= sure:
-                text = f"stop: a grasp works with a chance of {chance:.2f}"
-                self._recorder.record(Logged(self.step, "info", text))
-                self.flush()
-                self.stop = "grasp"
-                return None
+        if grasps is not None and self.grasped(*grasps, gripper, sure):
+            self.flush()
+            return None
         if actions is None:
             actions = self.actions() if self.steering is None else self.steering.actions
         accepted = "chsel.Actions(world_from_hand, length)"
@@ -507,6 +504,23 @@ class Session:
         self._taken.add(chosen)
         length = float(actions.length[chosen])
         return NextProbe(actions.world_from_hand[chosen], length, chosen, decision)
+
+    def grasped(
+        self, object_from_gripper: Any, width: Any, gripper: Gripper | None, sure: float
+    ) -> bool:
+        """Whether one of some grasps works with a chance of `sure`; `stop` is "grasp" then.
+
+        `grasp` and `grasp_chance` are those of the best one, see `PoseBelief.best_grasp`.
+        """
+        if self.answer is None or self.trust is None:
+            return False
+        self.grasp, self.grasp_chance = self.belief.best_grasp(object_from_gripper, width, gripper)
+        if self.grasp_chance < sure:
+            return False
+        text = f"stop: a grasp works with a chance of {self.grasp_chance:.2f}"
+        self._recorder.record(Logged(self.step, "info", text))
+        self.stop = "grasp"
+        return True
 
     def decide(self, available: BoolArray) -> Choice:
         """Choose one of the actions (A,) that are available, and record it."""

@@ -31,6 +31,7 @@ from replay.recorder import open_recorder
 from runners.command.choices import calls_for_anchored
 from runners.command.program import command, plain
 from runners.run.display import Display, compiling_line
+from runners.run.grasps import Grasps
 from runners.run.recording import make_run_folder, write_in_run_folder
 from runners.run.scene import ProbeConfig, Scene, open_scene, session_started
 from runners.run.session_run import Row, steps
@@ -50,6 +51,7 @@ def main(config: DictConfig) -> None:
     if why := _default_because():
         display.say(f"method={method_name} (the default for {why}; method=chsel is the paper's)")
     set_threads(checked.threads)
+    grasps = checked.grasp.grasps()
     method = build_method(method_name, method_config)
     with ExitStack() as stack:
         with Console().status("opening the session"), watched(lambda _: None):
@@ -65,7 +67,7 @@ def main(config: DictConfig) -> None:
         write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
         started = session_started(checked, values, method_name, scene)
         with Interrupt() as interrupt:
-            interrupted = run(folder, checked, method, scene, started, interrupt, display)
+            interrupted = run(folder, checked, method, scene, started, grasps, interrupt, display)
     if interrupted:
         sys.exit(130)
 
@@ -109,6 +111,7 @@ def run(
     method: Method,
     scene: Scene,
     started: SessionStarted,
+    grasps: Grasps | None,
     interrupt: Interrupt,
     display: Display,
 ) -> bool:
@@ -138,7 +141,10 @@ def run(
     outcome = "finished"
     try:
         try:
-            for row in steps(session, scene.session, timings=settings.timings):
+            walked = steps(
+                session, scene.session, timings=settings.timings, belief=True, grasps=grasps
+            )
+            for row in walked:
                 rows.append(row)
                 display.probe(row)
                 display.warn(session.warnings)
@@ -166,7 +172,9 @@ def run(
     display.table(rows)
     if outcome == "interrupted":
         display.say("interrupted: the recording holds everything up to here")
-    if steering is not None:
+    if session.stop == "grasp":
+        display.grasped(session)
+    elif steering is not None:
         display.stopped(steering)
     display.written(folder)
     display.pose(rows)

@@ -1,4 +1,4 @@
-"""Write hypotheses, points, archives, numbers, images or decisions as npz, csv or json.
+"""Write hypotheses, modes, points, archives, numbers, images or decisions as npz, csv or json.
 
 An npz file holds arrays, a csv or json file a table. Numbers are exact. NaN is an empty cell in a
 csv file; NaN and infinity are null in a json file.
@@ -20,7 +20,7 @@ import pandas as pd
 from rich.filesize import decimal
 
 from chsel.errors import RecordingError, SettingError
-from chsel.events import SensorImage
+from chsel.events import Believed, SensorImage
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import inverse, quaternions
 from chsel.problem.registration_problem import ArchiveSnapshot
@@ -239,8 +239,39 @@ def exported_decisions(recording: Recording, steps: str | None) -> Exported:
     return Exported(arrays.items(), pd.DataFrame(rows))
 
 
+def exported_modes(recording: Recording, steps: str | None) -> Exported:
+    """The modes of each recorded belief.
+
+    npz: `steps` (S,); of step K `step_K/numbers` (M,), the same for a mode at all steps,
+    `step_K/weights` (M,), `step_K/object_from_world` (M, 4, 4), `step_K/centres` (M, 3), of the
+    object, world, metres, `step_K/covariances` (M, 6, 6), of centres (metres) and rotation vectors
+    (radians), world axes, and `step_K/spread`, metres. Table: a row a mode; x, y, z are its centre,
+    position_deviation (metres) and rotation_deviation (radians) roots of the covariance's traces,
+    m00 to m33 object_from_world.
+    """
+    told = {e.step: e for e in recording.events(images=False) if isinstance(e, Believed)}
+    chosen = _chosen(recording, steps, [*told], "belief")
+    arrays: dict[str, Any] = {"steps": np.array(chosen, dtype=np.int64)}
+    tables = []
+    for step in chosen:
+        parts = {name: part for name, part in vars(told[step]).items() if name != "step"}
+        arrays |= {f"step_{step}/{name}": part for name, part in parts.items()}
+        squares = np.diagonal(parts["covariances"], axis1=1, axis2=2)
+        columns = {
+            "step": np.full(len(squares), step),
+            "number": parts["numbers"],
+            "weight": parts["weights"],
+            **dict(zip("xyz", parts["centres"].T, strict=True)),
+            "position_deviation": np.sqrt(squares[:, :3].sum(axis=1)),
+            "rotation_deviation": np.sqrt(squares[:, 3:].sum(axis=1)),
+        }
+        tables.append(pd.DataFrame(columns | _entries(parts["object_from_world"])))
+    return Exported(arrays.items(), pd.concat(tables))
+
+
 EXPORTS = {
     "hypotheses": exported_hypotheses,
+    "modes": exported_modes,
     "points": exported_points,
     "archive": exported_archive,
     "metrics": exported_metrics,

@@ -20,6 +20,7 @@ from chsel.policies import POLICIES, policy_settings
 from chsel.problem.settings import PRESETS, in_preset, settings_mapping
 from runners.objects.loader import OBJECTS
 from runners.objects.scans import URL
+from runners.run.grasps import GraspConfig
 from runners.run.recording import RecordingConfig
 from runners.sensors.rig import Rig
 from runners.sessions import SESSIONS
@@ -59,6 +60,7 @@ def store_choices() -> None:
         ("none", RecordingConfig(mcap=False, rerun=False)),
     ):
         store("recording", name, settings_mapping(written))
+    store("grasp", "default", settings_mapping(GraspConfig()))
     for preset in PRESETS:
         store("preset", preset, {"name": preset})
     store("search", "default", settings_mapping(TruePoseSettings()))

@@ -26,7 +26,14 @@ from runners.evaluation.trial_configurations import SENSORS
 from runners.evaluation.true_poses import ensure_log, guessed_pose, simulated_truth, sought_pose
 from runners.objects.scans import AssetsConfig
 from runners.run.recording import RecordingConfig
-from runners.run.scene import GRID, PresetName, ProbeConfig, open_scene, session_started
+from runners.run.scene import (
+    GRID,
+    GraspConfig,
+    PresetName,
+    ProbeConfig,
+    open_scene,
+    session_started,
+)
 from runners.sessions.problem_source import ProbedProblems
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 
@@ -88,6 +95,7 @@ def probe_config(plan: Plan, trial: Trial, policy: Contender | None = None) -> P
         method={"name": first.name, **first.settings} if first else {},
         policy={"name": policy.name, **policy.settings} if policy else {"name": GRID},
         preset=PresetName(str(first.preset) if first and policy else plan.preset),
+        grasp=GraspConfig(),
         recording=RecordingConfig(),
         assets=AssetsConfig(str(plan.assets), _NO_ARCHIVES),
         logs="",

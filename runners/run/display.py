@@ -19,7 +19,7 @@ from chsel.numerics.compiler import watched
 from chsel.policies.steering import Steering
 from chsel.problem.poses import quaternions
 from chsel.problem.registration_problem import Trust
-from chsel.session import FROM_SESSION, StepWarning
+from chsel.session import FROM_SESSION, Session, StepWarning
 from replay.console import Console, Progress, TextColumn, plain_table
 from runners.sensors.session_report import Report
 
@@ -113,6 +113,12 @@ class Display:
                 f"{1000.0 * decision.spread:.1f} mm)"
             )
 
+    def grasped(self, session: Session) -> None:
+        """That touching has ended as a grasp works, and where it is."""
+        assert session.grasp is not None
+        chance = f"{100.0 * session.grasp_chance:.0f} %"
+        self.say(f"stopped: a grasp works with a chance of {chance} (summary.json has its pose)")
+
     def probe(self, row: Mapping[str, Any]) -> None:
         """A probe, and the registration after it if there was one, are done."""
         text = f"probe {row['step']:>3} {row['outcome']:<7} {row['contacts']:>3} contacts"
@@ -199,6 +205,10 @@ class Display:
         self.say(f"best pose after probe {row['step']}, {where}:")
         self.say(f"  position {position} mm")
         self.say(f"  quaternion {quaternion} (x y z w)")
+        modes = row.get("belief", ())
+        if len(modes) > 1:
+            shares = ", ".join(f"{100.0 * mode['weight']:.0f} %" for mode in modes)
+            self.say(f"  modes have {shares} of the poses")
 
     def verdict(self, trust: Trust | None) -> None:
         """How far to trust the last result, if there is one."""

@@ -18,6 +18,7 @@ from chsel.problem.streams import StreamKey
 from replay.environment import environment
 from runners.objects.loader import ObjectConfig, ObjectModel, check_size, load_object
 from runners.objects.scans import AssetsConfig
+from runners.run.grasps import GraspConfig
 from runners.run.recording import RecordingConfig
 from runners.sensors.session_report import Report
 from runners.sessions import open_session, session_settings
@@ -52,6 +53,7 @@ class ProbeConfig:
     method: Any  # checked by the method
     policy: Any  # checked by the policy
     preset: PresetName
+    grasp: GraspConfig
     recording: RecordingConfig
     assets: AssetsConfig
     logs: str
@@ -155,6 +157,8 @@ def session_started(
     recorded["session"] = without_defaults(values["session"])
     if scene.steering is None:
         recorded.pop("policy", None)
+    if config.grasp.path is None:
+        recorded.pop("grasp", None)
     return SessionStarted(
         runner="probe",
         object=scene.object_name,

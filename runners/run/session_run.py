@@ -6,10 +6,12 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from chsel.belief import Mode
 from chsel.events import Logged, Probe, Timed
 from chsel.problem.poses import inverse
 from chsel.registration import Registered
 from chsel.session import Session
+from runners.run.grasps import Grasps
 from runners.sessions.source import ProbeEvent, ProbeSource, Steerable
 
 Row = dict[str, Any]
@@ -22,11 +24,14 @@ def steps(
     register: Callable[[Session], object] = Session.register_step,
     catch: type[Exception] | tuple[type[Exception], ...] = (),
     timings: bool = False,
+    belief: bool = False,
+    grasps: Grasps | None = None,
 ) -> Iterator[Row]:
     """Walk a session over a source; after each probe the numbers that are shown of it.
 
     register: of a step with enough points. catch: errors of a step that do not end the session.
-    timings: whether wall-clock times are recorded.
+    timings: whether wall-clock times are recorded. belief: whether the belief is. grasps: one of
+    which ends the session as soon as it works with the chance that is wanted.
     """
     if session.steering is not None:
         _decide(session, source)
@@ -51,8 +56,14 @@ def steps(
         }
         if session.registered is not None:
             row |= _numbers(session.registered)
-        if session.steering is not None:
+            if belief and session.registered.hypotheses.trust is not None:
+                row["belief"] = [_mode(mode) for mode in session.belief.modes]
+        if grasps and session.registered and session.grasped(*grasps):
+            row["stop"] = session.stop
+        elif session.steering is not None:
             row |= _decide(session, source)
+        if session.grasp is not None:
+            row |= {"grasp_chance": session.grasp_chance, "grasp": session.grasp.tolist()}
         text = f"probe {session.step}: {row['outcome']}, {row['contacts']} contacts"
         if "digest" not in row:
             text += ", too little for a registration"
@@ -62,6 +73,8 @@ def steps(
             session.observe(Timed(session.step, session.seconds))
         session.flush()
         yield row | {"seconds": sum(session.seconds.values()), "seconds_by_stage": session.seconds}
+        if session.stop == "grasp":
+            break
         begun = time.perf_counter()
     session.end_points()
 
@@ -77,6 +90,13 @@ def _numbers(registered: Registered) -> Row:
         row |= {"verdict": trust.verdict, "world_from_object": modes[0]}
         row["modes_world_from_object"] = modes
     return row
+
+
+def _mode(mode: Mode) -> Row:
+    """Numbers about a mode of a belief; metres and radians."""
+    position, rotation = mode.deviations
+    numbers: Row = {"number": mode.number, "weight": mode.weight}
+    return numbers | {"position_deviation": position, "rotation_deviation": rotation}
 
 
 def _events(session: Session, source: ProbeSource) -> Iterator[ProbeEvent]:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from chsel.errors import SettingError
-from chsel.events import HypothesesFound, SensorImage, SnapshotTaken
+from chsel.events import Believed, HypothesesFound, SensorImage, SnapshotTaken
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse
 from replay.__main__ import main
@@ -100,6 +100,19 @@ def test_hypotheses_are_the_recorded_ones(recording, events):
             assert [int(row["rank"]) for row in of_step] == [0, 1, 2, 3, 4]
             assert [int(row["duplicate"]) for row in of_step] == [0, 0, 1, 0, 1]
             assert [int(row["cell"]) for row in of_step] == [3, -1, 5, 1599, 0]
+
+
+def test_modes_are_those_of_the_recorded_beliefs(events, write):
+    covariance = np.diag([1.0, 4.0, 4.0, 0.0, 0.0, 9.0])[None]
+    poses, centres = np.eye(4)[None], np.array([[0.1, 0.2, 0.3]])
+    told = Believed(2, np.array([7]), np.array([0.75]), poses, centres, covariance, 0.01)
+    found = next(e for e in events if isinstance(e, HypothesesFound) and e.step == 2)
+    place = events.index(found) + 1
+    recording = read_recording(write([*events[:place], told, *events[place:]]))
+    (row,) = table(recording, "modes")
+    names = ("step", "number", "weight", "x", "y", "z", "position_deviation", "rotation_deviation")
+    assert [float(row[name]) for name in names] == [2, 7, 0.75, 0.1, 0.2, 0.3, 3.0, 3.0]
+    assert same_bits(arrays(recording, "modes")["step_2/covariances"], covariance)
 
 
 def test_positions_and_quaternions_turn_the_object_into_the_world(recording):

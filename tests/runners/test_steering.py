@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from chsel.events import Decided, Probe
+from chsel.events import Believed, Decided, Probe
 from chsel.policies.steering import Steering
+from replay.comparing.verification import EQUAL, verify
 from replay.mcap.reader import read_recording
 from runners import probe
 from tests.runners.in_process import run
@@ -64,6 +65,32 @@ def test_a_session_stops_when_the_plausible_poses_are_close_together(tmp_path):
     assert last.decision.stop == "spread"
     assert last.decision.spread <= 0.1 < decided(recording)[-2].decision.spread
     assert "policy.stop.spread" in done.stdout
+
+
+def test_a_session_ends_with_a_sure_grasp_and_says_how_sure_it_is_of_each_mode(tmp_path):
+    """A can of 26 cm by 15 cm, held across by very wide fingers, is within them in any pose."""
+    down = np.diag([1.0, -1.0, -1.0, 1.0])
+    file = tmp_path / "grasps.npz"
+    np.savez(file, object_from_gripper=down[None], width=3.0)
+    grasp = (f"grasp.path={file}", "grasp.gripper.opening=4", "grasp.gripper.length=0.1")
+    done, recording, summary = steered(tmp_path, "policy=information", *grasp)
+    assert "stopped: a grasp works with a chance of" in done.stdout
+    last = summary["steps"][-1]
+    assert last["stop"] == "grasp"
+    assert last["grasp_chance"] >= 0.95
+    assert all(row.get("grasp_chance", 0.0) < 0.95 for row in summary["steps"][:-1])
+    believed = [event for event in recording.events() if isinstance(event, Believed)]
+    assert [event.step for event in believed] == list(recording.steps)
+    for row, event in zip(summary["steps"][-len(believed) :], believed, strict=True):
+        assert [mode["weight"] for mode in row["belief"]] == event.weights.tolist()
+    assert {verdict.outcome for verdict in verify(recording)} == {EQUAL}
+    np.savez(file, object_from_gripper=down[None])
+    done = run(probe.main, *SESSION, *grasp, f"logs={tmp_path}")
+    assert done.returncode == 2
+    assert done.stderr == (
+        f"error: grasp.path is {file} (width is not a file in the archive); accepted: an .npz file "
+        "with object_from_gripper (G, 4, 4) and width (G,), metres\n"
+    )
 
 
 def test_a_surprise_starts_the_next_registration_afresh(tmp_path, monkeypatch):

@@ -50,9 +50,10 @@ def near_and_far():
         (points_with(60), 0.004),
         (KnownPoints(free=FREE, known=contacts_on(BOX, 20)), 0.0),
         (KnownPoints(free=FREE), 0.004),
+        (KnownPoints(free=[*FREE, [1e8, 0.0, 0.0]]), 0.0),
         (KnownPoints(occupied=OCCUPIED), 0.0),
     ],
-    ids=["few contacts", "many contacts", "exact contacts", "free", "occupied"],
+    ids=["few contacts", "many contacts", "exact contacts", "free", "far free", "occupied"],
 )
 def test_energy_is_the_plain_formula(points, shared):
     noise, poses = noise_model(SENSOR, shared), near_and_far()
