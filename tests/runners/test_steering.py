@@ -79,7 +79,13 @@ def test_a_session_ends_with_a_sure_grasp_and_says_how_sure_it_is_of_each_mode(t
     assert "stopped: a grasp works with a chance of" in done.stdout
     last = summary["steps"][-1]
     assert last["stop"] == "grasp"
-    assert last["grasp_chance"] >= 0.95
+    assert last["grasp_chance"] == 1.0
+    # Wilson's interval of n successes in n trials is from n / (n + z^2) to 1.
+    lower, upper = last["grasp_chance_interval"]
+    trials = lower / (1.0 - lower) * 1.6449**2
+    assert (trials, upper) == pytest.approx((round(trials), 1.0))
+    assert 1 < trials < 31
+    assert last["action"] == decided(recording)[-1].decision.chosen
     assert all(row.get("grasp_chance", 0.0) < 0.95 for row in summary["steps"][:-1])
     believed = [event for event in recording.events() if isinstance(event, Believed)]
     assert [event.step for event in believed] == list(recording.steps)
