@@ -1,7 +1,5 @@
 """What is registered: every method, preset, measure, and form of the cost, at least once."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any

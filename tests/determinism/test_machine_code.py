@@ -1,11 +1,8 @@
-"""No CPU fuses a product and a sum, as that would round once where another rounds twice."""
+"""LLVM may fuse, reorder or replace nothing, whatever the CPU that it makes machine code for."""
 
 import importlib
-import math
 import re
 
-import llvmlite.binding as llvm
-import numba
 import numpy as np
 import pytest
 import trimesh
@@ -23,8 +20,7 @@ from chsel.sensing.free_space import FreeGrid
 from tests.chsel.samples import REPOSITORY, hypotheses_at, kernel_files
 from tests.determinism.cases import CASES
 from tests.determinism.decisions import decision_stages
-from tests.determinism.record import IS_X86
-from tests.determinism.record import fused as contracted
+from tests.determinism.record import fused
 from tests.determinism.stages import grid, run, scene
 
 pytestmark = pytest.mark.slow  # compiles nearly all kernels
@@ -35,19 +31,10 @@ ENOUGH += ("medial_constraint default", "medial_constraint_cma_me default", "med
 # By IEEE 754, or not of numbers.
 EXACT = {"sqrt", "sqrtf", "floor", "floorf", "rint", "rintf", "memset", "memcpy", "memmove"}
 
-# Counting references is all for which the host's own intrinsics stand in the optimised code; it
-# is left out where that code is made anew for another CPU.
-_REFERENCE_COUNT = re.compile(r"(= )(?:tail )?call i8 @llvm\.x86\.atomic\.[^\n]*")
-_OF_ONE_CPU = re.compile(r"llvm\.(?:x86|aarch64|arm|ppc)\.[\w.]+")
-_TARGET = re.compile(r'^target (?:datalayout|triple) = ".*"\n', re.MULTILINE)
 _DECLARED = re.compile(r"^declare [^@\n]*@([\w.]+)\(", re.MULTILINE)
 _OF_LLVM = r"llvm\.(?!fma|exp(?!erimental\.noalias)|log|sin|cos|tan|pow|a(?:sin|cos|tan))"
 _PYTHON = re.compile(rf"_?(?:Py|NRT_|numba_|{_OF_LLVM})")
 _LOOSE = re.compile(r"\b(?:fast|reassoc|contract|arcp|afn|nsz)\b(?= )|llvm\.fmuladd|llvm\.fma\b")
-_FUSED = re.compile(
-    r"^\s+(vfn?m(?:add|sub|addsub|subadd)\w*|fn?m(?:add|sub)|fml[as]|fml[as]l2?|bfmla\w*)\s.*$",
-    re.MULTILINE,
-)
 
 
 def optimised(dispatcher):
@@ -59,48 +46,9 @@ def optimised(dispatcher):
     return [str(result.library._get_module_for_linking()) for result in results]
 
 
-def assembly(code, cpu):
-    """The assembly of code for a CPU. Raises ValueError for code that is for this host alone."""
-    code = _TARGET.sub("", code)
-    if cpu.triple != llvm.get_process_triple():
-        code = _REFERENCE_COUNT.sub(r"\1add i8 0, 0", code)
-        calls = "\n".join(line for line in code.splitlines() if not line.startswith("declare"))
-        if foreign := set(_OF_ONE_CPU.findall(calls)):
-            raise ValueError(f"the code holds {sorted(foreign)}, which {cpu.triple} lacks")
-    module = llvm.parse_assembly(code)
-    module.triple, module.data_layout = cpu.triple, str(cpu.target_data)
-    return cpu.emit_assembly(module)
-
-
-def fused(code, cpu):
-    """The instructions of a CPU that multiply and add with one rounding, x86-64 and ARM."""
-    return _FUSED.findall(assembly(code, cpu))
-
-
 def called(code):
     """The functions outside of it that LLVM code calls, but for those of Python and numba."""
     return {name for name in _DECLARED.findall(code) if not _PYTHON.match(name)}
-
-
-def target(triple, cpu, features=""):
-    """Any CPU that LLVM knows."""
-    llvm.initialize_all_targets()
-    llvm.initialize_all_asmprinters()
-    made = llvm.Target.from_triple(triple)
-    return made.create_target_machine(cpu=cpu, features=features, opt=3)
-
-
-@pytest.fixture(params=["host", "ARM"])
-def cpu(request):
-    """This CPU, or one of its kind that can fuse if it cannot itself; or an ARM."""
-    if request.param == "ARM":
-        if not IS_X86:
-            pytest.skip("code of this CPU cannot be made anew for another")
-        return target("aarch64-unknown-linux-gnu", "generic")
-    features = llvm.get_host_cpu_features()
-    if IS_X86 and not features.get("fma"):
-        return target("x86_64-unknown-linux-gnu", "haswell", "+avx2,+fma")
-    return target(llvm.get_process_triple(), llvm.get_host_cpu_name(), features.flatten())
 
 
 def _from_python():
@@ -148,11 +96,6 @@ def test_every_kernel_that_python_calls_is_looked_at(code):
     assert [name for name, texts in code.items() if not texts] == []
 
 
-def test_no_product_is_fused_with_a_sum(cpu, code):
-    found = {name: [fused(text, cpu) for text in texts] for name, texts in code.items()}
-    assert {name: each for name, each in found.items() if any(each)} == {}
-
-
 def test_no_code_may_be_reordered_or_call_what_others_round_otherwise(code):
     for name, texts in code.items():
         for text in texts:
@@ -160,18 +103,6 @@ def test_no_code_may_be_reordered_or_call_what_others_round_otherwise(code):
             assert called(text) <= EXACT, name
 
 
-def test_what_compilers_like_to_fuse_or_call_would_be_found(cpu):
-    def planted(x, y):
-        return x * y + 1.0
-
-    loosely = numba.njit("float64(float64, float64)", fastmath={"contract"})(planted)
-    contracted(np.ones(3))
-    for function in (loosely, contracted):
-        (text,) = optimised(function)
-        assert _LOOSE.findall(text)
-        assert fused(text, cpu)
-    (text,) = optimised(numba.njit("float64(float64, float64)")(planted))
-    assert not _LOOSE.findall(text)
-    assert not fused(text, cpu)
-    (text,) = optimised(numba.njit("float64(float64)")(lambda x: math.exp(x) + math.sin(x)))
-    assert {"exp", "sin"} <= {word for name in called(text) for word in re.findall("exp|sin", name)}
+def test_what_may_be_fused_would_be_found():
+    fused(np.ones(3))
+    assert _LOOSE.findall(optimised(fused)[0])

@@ -1,7 +1,5 @@
 """A small session whose events have everything that a recording can hold."""
 
-from __future__ import annotations
-
 import dataclasses
 from contextlib import closing
 from typing import Any

@@ -175,7 +175,7 @@ def test_everything_is_saved(path, tmp_path, capsys):
     assert float(rows[0]["best_position_error_m"]) < 0.5
     assert float(rows[0]["best_rotation_error_rad"]) <= math.pi
     assert rows[0]["seconds_s"] == ""
-    assert 0.0 < float(rows[1]["seconds_s"]) < 60.0
+    assert float(rows[1]["seconds_s"]) > 0.0
     assert {row["method"] for row in rows} == {"chsel", "gradient_descent"}
     assert [row["changes"] for row in rows[:2]] == ["", "descent.iterations=4"]
     assert saved["png"].read_bytes().startswith(b"\x89PNG")

@@ -1,7 +1,5 @@
 """What is exported is what was recorded, to the bit, and other programs can read it."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,14 +1,10 @@
 """Recorders behind one list: order, errors that reach the caller, and what is on the disk when."""
 
-from __future__ import annotations
-
 import os
-import re
 import signal
 import subprocess
 import sys
 import threading
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -19,9 +15,6 @@ from replay.files import new_file
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
 from replay.recorder import Recorders
-
-REPOSITORY = Path(__file__).resolve().parents[2]
-ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
 
 
 class Gate:
@@ -45,7 +38,7 @@ class Gate:
         self._note("close")
 
     def _note(self, call):
-        assert self.gate.wait(60)
+        assert self.gate.wait(600)
         self.calls.append(call)
         self.threads.add(threading.current_thread())
         if call in self._fails_at:
@@ -129,67 +122,19 @@ def test_all_that_was_flushed_survives_sigkill(tmp_path, events, assert_same):
     assert_same(recording.events(), events[: last + 1])
 
 
-@dataclass
-class Synced:
-    """What was synced to the disk: of files the size then, by inode; of folders the names then."""
-
-    sizes: dict[int, int] = field(default_factory=dict)
-    names: dict[int, list[str]] = field(default_factory=dict)
-
-    def holds(self, path):
-        """Whether a file as it is now, and then its name, are on the disk."""
-        there = path.stat()
-        named = path.name in self.names.get(path.parent.stat().st_ino, [])
-        return named and self.sizes.get(there.st_ino) == there.st_size
-
-
-@pytest.fixture
-def synced(monkeypatch):
-    """Follows os.fsync."""
-    found = Synced()
-
-    def fsync(number):
-        there = os.fstat(number)
-        if os.path.isdir(f"/proc/self/fd/{number}"):
-            found.names[there.st_ino] = os.listdir(number)
-        else:
-            found.sizes[there.st_ino] = there.st_size
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    return found
-
-
-def test_a_recording_is_on_the_disk_when_it_is_closed(events, tmp_path, synced):
-    path = tmp_path / "recording.mcap"
-    recorder = McapRecorder(path)
-    for event in events:
-        recorder.record(event)
+def test_a_recording_is_on_the_disk_when_it_is_closed(events, tmp_path, monkeypatch):
+    recorder, synced = McapRecorder(tmp_path / "a.mcap"), []
+    monkeypatch.setattr(os, "fsync", lambda number: synced.append(os.fstat(number)))
+    recorder.record(events[0])
     recorder.flush()
-    assert not synced.holds(path)  # a step waits for no disk
+    assert synced == []  # a step waits for no disk
     recorder.close()
-    assert synced.holds(path)
+    last = {each.st_ino: each.st_size for each in synced}
+    file, folder = (tmp_path / "a.mcap").stat(), tmp_path.stat()
+    assert (last[file.st_ino], folder.st_ino in last) == (file.st_size, True)
 
 
 def test_a_link_to_nothing_is_not_written_over(tmp_path):
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
     with pytest.raises(RecordingError, match="link exists"), new_file(tmp_path / "link"):
         pass
-
-
-@pytest.mark.slow
-def test_every_reported_probe_survives_kills_at_random_moments():
-    """In a process of its own: a fork needs one without the threads of other tests."""
-    command = [sys.executable, "-m", "tests.tools.kill_sessions", "--count", "30", "--seed", "1"]
-    process = subprocess.run(
-        command, capture_output=True, text=True, env=ENVIRONMENT, cwd=REPOSITORY, timeout=300
-    )
-    assert process.returncode == 0, process.stderr
-    figures = re.match(
-        r"(\d+) kills, (\d+) before .*, (\d+) after .*; (\d+) probes reported, (\d+) recovered",
-        process.stdout,
-    )
-    assert figures is not None, process.stdout
-    kills, without, ended, reported, recovered = map(int, figures.groups())
-    assert kills == 30
-    assert without + ended < 0.7 * kills  # most kills came in between
-    assert kills < reported <= recovered

@@ -1,7 +1,5 @@
 """A recorded step again: what is run, what is written, what is said."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What all verbs share: their names, steps, texts on a terminal, and files they leave alone."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,11 +1,8 @@
 """`replay verify`: equal bits, the smallest difference, files that cannot be used."""
 
 import dataclasses
-import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -169,40 +166,3 @@ def test_what_cannot_be_verified_is_one_line_and_status_2(arguments, message, ca
     assert shown.startswith("error: ")
     assert message in shown
     assert shown.count("\n") == 1
-
-
-KERNEL = "chsel/cost/cost_kernels.py"
-LINE = "value = scale * excess"
-PLANTED = "value = 1.0000000000001 * scale * excess"
-
-
-def verified(folder, **changes):
-    """`replay verify` with the packages in a folder."""
-    recording = REPLAYS / "spam_can_gradient_descent.mcap"
-    return subprocess.run(
-        [sys.executable, "-m", "replay", "verify", str(recording)],
-        cwd=folder,
-        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(folder), **changes},
-        capture_output=True,
-        text=True,
-    )
-
-
-@pytest.mark.slow
-def test_a_change_in_a_kernel_is_compiled_and_found(tmp_path):
-    for package in ("chsel", "replay"):
-        unwanted = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(REPOSITORY / package, tmp_path / package, ignore=unwanted)
-    same = verified(tmp_path)
-    assert same.returncode == 0, same.stderr
-    assert "4 of 4 steps equal" in same.stdout
-    text = (tmp_path / KERNEL).read_text()
-    assert text.count(LINE) == 1
-    (tmp_path / KERNEL).write_text(text.replace(LINE, PLANTED))
-    done = verified(tmp_path, CHSEL_CACHE_DIR=str(tmp_path / "kept"))
-    assert "compiling the kernels" in done.stderr
-    assert done.returncode == 1
-    stages = re.findall(r"first difference: (.*) \(", done.stdout)
-    steps = re.findall(r"step -?\d+, \w+: differs", done.stdout)
-    assert len(steps) == len(stages) > 0
-    assert set(stages) == {"descent, iteration 0"}, done.stdout

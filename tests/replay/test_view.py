@@ -1,7 +1,5 @@
 """view and info."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -93,7 +91,7 @@ def test_the_web_viewer_is_served_here_alone_and_ends_with_the_command(
             assert rerun_viewer.is_listening(data)
             assert [file.name for file in folder.rglob("*.rrd")] == ["recording.rrd"]
             viewing.send_signal(ending)
-            assert viewing.wait(30.0) == status
+            assert viewing.wait(600) == status
         finally:
             viewing.kill()  # else the block would wait for one that a failure has left behind
     assert not rerun_viewer.is_listening(page)

@@ -1,7 +1,5 @@
 """Commands run in this process, which spares them the imports."""
 
-from __future__ import annotations
-
 import io
 import sys
 import warnings

@@ -4,24 +4,22 @@ import shutil
 
 import numpy as np
 import pytest
-import trimesh
 import yaml
 
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_settings import EvaluationCostSettings
 from chsel.problem.mesh import clean_mesh
-from chsel.problem.poses import apply, axis_angle, compose, inverse
+from chsel.problem.poses import inverse
 from replay.files import file_digest
 from replay.mcap.reader import read_recording
-from runners import align, plausible, probe
+from runners import align, plausible
 from runners.objects.loader import load_model
 from runners.sensors.pose_file import beside, read_pose
 from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
+from tests.runners.box_session import POSE, recorded_box
 from tests.runners.in_process import run
 
-YAW = 0.5
-POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(YAW)), np.array([0.1, 0.2, 0.3]))
 NEAR = ("position=[0.12,0.19,0.31]", "rotation=[0,0,0.46]")
 SEARCH = ("search.reach=0.03", "search.rotations=200", "search.angle=0.04")
 SETS = ("definition.grid.rotations=200", "definition.grid.upright=0")
@@ -30,26 +28,7 @@ SETS = ("definition.grid.rotations=200", "definition.grid.upright=0")
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """A recording of points on a box whose pose nobody told."""
-    folder = tmp_path_factory.mktemp("align")
-    box = trimesh.creation.box((0.1, 0.06, 0.2))
-    box.export(folder / "box.ply")
-    surface = apply(POSE, trimesh.sample.sample_surface(box, 60, seed=0)[0])
-    free = apply(POSE, np.random.default_rng(0).uniform(0.12, 0.2, (40, 3)))
-    steps = np.arange(60) // 30
-    np.savez(folder / "box.npz", surface=surface, surface_step=steps, free=free)
-    done = run(
-        probe.main,
-        "session=points",
-        f"session.path={folder / 'box.npz'}",
-        "object=mesh",
-        f"object.path={folder / 'box.ply'}",
-        "object.epsilon=0.002",
-        "method=gradient_descent",
-        "recording=mcap",
-        f"logs={folder / 'logs'}",
-    )
-    assert done.returncode == 0, done.stderr
-    (recording,) = (folder / "logs").rglob("recording.mcap")
+    recording = recorded_box(tmp_path_factory.mktemp("align"), contacts=30, world_from_object=None)
     assert read_recording(recording).start.world_from_object is None
     return recording
 

@@ -1,11 +1,8 @@
 """Files whose names Hydra would read as its own grammar, as they are typed in a shell."""
 
-import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
-import trimesh
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
@@ -46,19 +43,6 @@ def test_the_home_folder_is_put_in_and_what_hydra_reads_stays(monkeypatch):
     unchanged += ["settings={icp: {iterations: 3}}", "~object.path", "-m", "seed=1,2"]
     assert hydra_arguments("probe", unchanged) == unchanged
     assert hydra_arguments("probe", ["seed=1,2"]) == ["seed='1,2'"], "no sweep without -m"
-
-
-@pytest.fixture
-def home(tmp_path, monkeypatch):
-    """A home folder with a mesh and points of strange names."""
-    monkeypatch.setenv("HOME", str(tmp_path))
-    box = trimesh.creation.box((0.1, 0.06, 0.2))
-    box.export(tmp_path / "mesh.obj")
-    shutil.copy(tmp_path / "mesh.obj", tmp_path / "a,b [c]'d.obj")
-    points = trimesh.sample.sample_surface(box, 6, seed=0)[0]
-    free = np.array([[0.4, 0.0, 0.0], [0.0, 0.4, 0.0]])
-    np.savez(tmp_path / "Prüf körper,1.npz", surface=points, free=free, world_from_object=np.eye(4))
-    return tmp_path
 
 
 def test_words_without_a_key_get_that_of_the_command(tmp_path, monkeypatch):

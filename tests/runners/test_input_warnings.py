@@ -6,14 +6,13 @@ import numpy as np
 import trimesh
 
 from chsel.events import Logged
-from chsel.problem.poses import apply, axis_angle, compose, inverse
+from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from replay.mcap.reader import read_recording
 from runners.probe import main
+from tests.runners.box_session import BOX, POSE
 from tests.runners.in_process import run
 
-BOX = trimesh.creation.box((0.1, 0.06, 0.2))
-POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
 SURFACE = apply(POSE, trimesh.sample.sample_surface(BOX, 30, seed=0)[0])
 STEPS = np.arange(30) // 10
 FREE = np.random.default_rng(0).uniform(-0.3, 0.3, (3000, 3)) + POSE[:3, 3]

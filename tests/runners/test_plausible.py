@@ -1,28 +1,24 @@
 """runners.plausible, and definitions of plausible sets."""
 
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
-import trimesh
 
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import load_plausible, plausible_set, read_plausible
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.problem.points import KnownPoints
-from chsel.problem.poses import apply, axis_angle, compose
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import settings_mapping
 from chsel.problem.streams import StreamKey
 from replay.mcap.reader import read_recording
-from runners import plausible, probe
+from runners import plausible
 from runners.sensors.pose_file import beside, write_pose
 from tests.chsel.plausible.scenes import WORKSPACE, ball
+from tests.runners.box_session import POSE, recorded_box
 from tests.runners.in_process import run
 
-POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
 SMALL = (
     "definition.grid.rotations=200",
     "definition.grid.upright=4",
@@ -36,27 +32,10 @@ SMALL = (
 def folder(tmp_path_factory):
     """A box, points on it in two files, of which one says where it is, and a recording."""
     folder = tmp_path_factory.mktemp("plausible")
-    box = trimesh.creation.box((0.1, 0.06, 0.2))
-    box.export(folder / "box.ply")
-    surface = apply(POSE, trimesh.sample.sample_surface(box, 30, seed=0)[0])
-    free = np.random.default_rng(0).uniform(0.3, 0.6, (40, 3))
-    points = {"surface": surface, "surface_step": np.arange(30) // 15, "free": free}
-    np.savez(folder / "box.npz", **points, world_from_object=POSE)
-    np.savez(folder / "unknown.npz", **points)
-    arguments = [
-        "session=points",
-        f"session.path={folder / 'box.npz'}",
-        "object=mesh",
-        f"object.path={folder / 'box.ply'}",
-        "object.epsilon=0.002",
-        "method=gradient_descent",
-        "recording=mcap",
-        f"logs={folder / 'logs'}",
-    ]
-    done = run(probe.main, *arguments)
-    assert done.returncode == 0, done.stderr
-    (recording,) = (folder / "logs").rglob("recording.mcap")
-    recording.rename(folder / "recording.mcap")
+    recorded_box(folder, contacts=15).rename(folder / "recording.mcap")
+    with np.load(folder / "box.npz") as points:
+        arrays = {name: points[name] for name in points.files if name != "world_from_object"}
+    np.savez(folder / "unknown.npz", **arrays)
     return folder
 
 
@@ -68,9 +47,7 @@ def rows(output):
 
 def test_a_recording_gets_its_sets_and_its_hypotheses_are_measured(folder):
     path = folder / "recording.mcap"
-    command = [sys.executable, "-m", "runners.plausible", str(path), *SMALL]
-    environment = {**os.environ, "COLUMNS": "160"}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    done = run(plausible.main, str(path), *SMALL)
     assert (done.returncode, done.stderr) == (0, "")
     assert "epsilon 2 mm" in done.stdout
     assert [row[0] for row in rows(done.stdout)] == ["0", "1"]

@@ -1,7 +1,5 @@
 """The command, as a user runs it."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess
@@ -26,8 +24,8 @@ from replay.mcap.reader import read_recording
 from runners import probe
 from runners.command.choices import CONF
 from runners.run.display import MEANINGS
+from tests.runners.box_session import points_session
 from tests.runners.in_process import run as in_process
-from tests.tools.kill_sessions import points_session
 
 QUICK = (
     "method.descent.restarts=2",
@@ -220,13 +218,12 @@ def test_ctrl_c_ends_with_a_whole_recording_and_status_130(points, tmp_path):
     process = subprocess.Popen(command + slow, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     recordings: list[Path] = []
-    deadline = time.monotonic() + 60
-    while not recordings and time.monotonic() < deadline:
+    while not recordings:
+        assert process.poll() is None
         recordings = list(tmp_path.rglob("recording.mcap"))
         time.sleep(0.1)
-    time.sleep(2.0)
     process.send_signal(signal.SIGINT)
-    output = process.communicate(timeout=60)[0]
+    output = process.communicate()[0]
     assert process.returncode == 130
     assert "interrupted: the recording holds everything up to here" in output
     recording = read_recording(recordings[0])

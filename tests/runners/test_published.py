@@ -1,7 +1,5 @@
 """The published package on the sessions of an evaluation, with a stand-in for its process."""
 
-from __future__ import annotations
-
 import enum
 import json
 from collections.abc import Sequence

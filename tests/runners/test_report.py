@@ -1,7 +1,5 @@
 """The report on methods: tables computed by hand, what the figures draw, and the files."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The numbers of one row of the table, of hypotheses made up around the true pose of a session."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

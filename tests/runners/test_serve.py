@@ -111,14 +111,14 @@ def test_others_are_answered_during_a_registration_and_its_own_session_waits(ser
 
     def slow(session):
         entered.set()
-        assert go_on.wait(60)
+        assert go_on.wait(600)
         return register(session)
 
     ask(address, f"{path}/add", contacts=ON_BOX)
     monkeypatch.setattr(chsel.Session, "register", slow)
     with ThreadPoolExecutor(2) as pool:
         registered = pool.submit(ask, address, f"{path}/register", b"")
-        assert entered.wait(60)
+        assert entered.wait(600)
         added = pool.submit(ask, address, f"{path}/add", contacts=ON_BOX[:1])
         assert ask(address, f"{other}/add", contacts=ON_BOX)[0] == 200
         steps = {one["session"]: one["step"] for one in ask(address, "/sessions")[1]["sessions"]}

@@ -80,37 +80,3 @@ def _is_integer(exponent):
 def test_kernels_use_allowed_arithmetic_alone(path):
     kernels_alone = path.parent.name == "numerics" or path.stem.endswith("_kernels")
     assert findings(path.read_text(), everywhere=kernels_alone) == []
-
-
-def test_beside_python_code_kernels_alone_are_searched():
-    outside = "import numpy as np\ndef f(x):\n    return np.cumsum(x)\n"
-    assert findings(outside) == ["3: numpy.cumsum"]
-    assert findings(outside, everywhere=False) == []
-    assert findings(outside.replace("def", "@inner\ndef"), everywhere=False) == ["4: numpy.cumsum"]
-
-
-FUNCTION = "import math as m\nimport numpy as np\nBITS = 20\nRATE = 0.5\n@compiled\ndef f(x, y):\n"
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "return m.exp(x)",
-        "return np.sin(x) + 1.0",
-        "return x.T.sum()",
-        "return sum(x)",
-        "return x @ x",
-        "return x**RATE",
-        "return pow(x, 2)",
-        "from math import cos",
-        "from numpy.linalg import norm",
-        "return inner_compiled(x, fastmath=True)",
-    ],
-)
-def test_what_is_not_allowed_is_found(line):
-    assert len(findings(f"{FUNCTION}    {line}\n")) == 1
-
-
-def test_what_is_allowed_is_not_found():
-    line = "return m.sqrt(x) + np.rint(x) + abs(x) + x**2 + 2.0**-27 + 2.0**BITS + exp(x) + s.mean"
-    assert findings(f"{FUNCTION}    {line}[0]\n") == []

@@ -50,7 +50,7 @@ def start(code, *words, root=ROOT, **changes):
 
 def result_of(process):
     """What the process printed, and what on stderr."""
-    out, errors = process.communicate(timeout=300)
+    out, errors = process.communicate()
     assert process.returncode == 0, errors
     return out, errors
 
@@ -87,17 +87,3 @@ def test_a_folder_that_others_can_write_to_is_refused(tmp_path, monkeypatch):
         f"CHSEL_CACHE_DIR is {named}, but others can write to {named.parent}, and compiled kernels "
         "are executed; accepted: a folder that only you, and root, can write to (chmod go-w)"
     )
-    command = [sys.executable, "-m", "runners.probe", "object=mustard", f"logs={tmp_path}"]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
-    assert (done.returncode, done.stderr) == (2, f"error: {error.value}\n")
-    named.parent.chmod(0o1777)  # sticky, as /tmp
-    assert directory().parent == named
-    folder = next(named.iterdir())
-    for part, mode in ((named, 0o720), (folder, 0o1777)):
-        part.chmod(mode)
-        with pytest.raises(SettingError, match=f"others can write to {part}, and compiled"):
-            directory()
-        part.chmod(0o700)
-    monkeypatch.setenv("CHSEL_CACHE_DIR", str(ROOT / "README.md"))
-    with pytest.raises(SettingError, match="which cannot be written; accepted: a folder for"):
-        directory()

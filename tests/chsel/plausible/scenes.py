@@ -1,7 +1,5 @@
 """Small objects and known points around them, made up at random."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The plausible set against brute force, and what must hold for any."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

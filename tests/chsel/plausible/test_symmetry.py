@@ -1,7 +1,5 @@
 """Symmetries of objects, and true poses up to them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import permutations, product
 

@@ -1,7 +1,5 @@
 """What several tests of the library share."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

@@ -1,7 +1,5 @@
 """The archive, also against a plain loop, and the measures of its cells."""
 
-from __future__ import annotations
-
 import math
 
 import numba

@@ -1,7 +1,5 @@
 """The compiled searches around landscapes that bring them to every turn."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numba

@@ -1,7 +1,5 @@
 """The archive and both emitters against pyribs."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Messages of the table: exact both ways, strict about types, shapes and bytes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

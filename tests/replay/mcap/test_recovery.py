@@ -1,12 +1,9 @@
 """What `replay recover` saves of a damaged or unfinished recording, and what it never makes up."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json
 import struct
-from collections import Counter
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -28,13 +25,11 @@ from chsel.events import (
 from chsel.problem.sdf_grid import object_grid
 from replay.__main__ import main
 from replay.comparing.verification import EQUAL, NO_RESULT, verify
-from replay.mcap.log_file import RawFile
 from replay.mcap.reader import read_recording
 from replay.mcap.recovery import recover, tells_loss
 from replay.mcap.writer import McapRecorder
 from replay.verbs.info import recording_info
 from tests.replay.conftest import example_events, nth, same_bits
-from tests.runners.sensors.small_logs import ros2_sent, write_ros2
 from tests.tools.small_recordings import registered_session
 
 
@@ -237,14 +232,6 @@ def original(tmp_path_factory):
     """A recording with a chunk for each of six probes: its bytes and events."""
     path = tmp_path_factory.mktemp("whole") / "whole.mcap"
     return recorded(path, events := example_events(steps=6, free=400)), events
-
-
-@pytest.fixture(scope="module")
-def log(tmp_path_factory):
-    """The bytes and messages of a robot's log."""
-    path = tmp_path_factory.mktemp("log") / "whole.mcap"
-    data = write_ros2(path, ros2_sent(8), chunk_size=1500)
-    return data, Counter(RawFile(path).messages(None, lambda fault: None))
 
 
 def answer(path, question):

@@ -1,7 +1,5 @@
 """Values and orders of events that writer and reader refuse, each with one clear line."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

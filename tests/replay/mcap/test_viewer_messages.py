@@ -1,7 +1,5 @@
 """What viewers draw of a recording without our help."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The Rerun recording of a robot's session, read back with Rerun's own reader."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Models of objects, and scans."""
 
-from __future__ import annotations
-
 import io
 import tarfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A log of ROS 2 said again in Foxglove's messages."""
 
-from __future__ import annotations
-
 from importlib import import_module
 
 import numpy as np

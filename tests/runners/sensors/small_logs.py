@@ -1,7 +1,5 @@
 """Small logs as robots write them, with messages of all kinds that are read, and their sessions."""
 
-from __future__ import annotations
-
 import struct
 from io import BytesIO
 from typing import Any

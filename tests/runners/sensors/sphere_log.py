@@ -1,7 +1,5 @@
 """A log of a made-up robot that presses a bubble pad onto a sphere while a camera looks on."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Simulated logs: is what they hold where the object is?"""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

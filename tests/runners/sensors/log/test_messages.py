@@ -1,7 +1,5 @@
 """Messages and images of logs."""
 
-from __future__ import annotations
-
 import struct
 from collections import Counter
 
