@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
 from pathlib import Path
 
@@ -20,19 +21,29 @@ SCRIPTS = tuple(PROJECT["scripts"])
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """The folder of packages of an installation of the checkout; its scripts are in `bin`."""
-    folder = tmp_path_factory.mktemp("installation")
+def built(tmp_path_factory):
+    """The sdist and the wheel of the checkout."""
+    folder = tmp_path_factory.mktemp("built")
     listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
     files = subprocess.run(listed, cwd=REPOSITORY, capture_output=True, text=True, check=True)
     for name in files.stdout.split():
         if (REPOSITORY / name).is_file():
             (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(REPOSITORY / name, folder / "source" / name)
-    options = ["--no-deps", "--no-build-isolation", "--quiet", "--target", str(folder / "site")]
-    install = [sys.executable, "-m", "pip", "install", str(folder / "source"), *options]
+    build = "from setuptools import build_meta as b; b.build_sdist('..'); b.build_wheel('..')"
+    subprocess.run([sys.executable, "-c", build], cwd=folder / "source", check=True)
+    (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
+    return {"sdist": sdist, "wheel": wheel}
+
+
+@pytest.fixture(scope="module")
+def site(built, tmp_path_factory):
+    """The folder of packages of an installation of the wheel; its scripts are in `bin`."""
+    folder = tmp_path_factory.mktemp("installation")
+    options = ["--no-deps", "--quiet", "--target", str(folder)]
+    install = [sys.executable, "-m", "pip", "install", str(built["wheel"]), *options]
     subprocess.run(install, check=True)
-    return folder / "site"
+    return folder
 
 
 @pytest.fixture
@@ -55,19 +66,44 @@ def test_four_packages_with_their_data_and_no_tests_are_installed(site):
         assert names == {str(file.relative_to(site)) for file in site.glob(pattern)}
 
 
-def test_the_installed_command_runs_in_any_folder(site, ran, tmp_path):
+def test_the_sdist_has_the_checkout_without_its_tests(built):
+    with tarfile.open(built["sdist"]) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    listed = subprocess.run(["git", "ls-files"], cwd=REPOSITORY, capture_output=True, text=True)
+    left_out = {name.partition("/")[0] for name in set(listed.stdout.split()) - names}
+    assert left_out == {".ci", ".gitignore", "logs", "tests"}
+    assert not {name for name in names if name.startswith("tests")}
+
+
+@pytest.mark.parametrize("archive", ["wheel", "sdist"])
+@pytest.mark.parametrize("version", ["3.11", "3.12", "3.13"])
+def test_an_installation_registers_in_any_folder_as_here(version, archive, built, tmp_path):
+    """To the bit: a stored recording, registered again by the installed package."""
+    pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
+    pythons = [*pyenv.glob(f"versions/{version}.*/bin/python"), shutil.which(f"python{version}")]
+    if pythons[0] is None:
+        pytest.skip(f"Python {version} is not on this machine")
+    subprocess.run([pythons[0], "-m", "venv", tmp_path / "venv"], check=True)
+    path = tmp_path / "venv" / "bin"
+    constraints = ["--constraint", REPOSITORY / "constraints.txt"]
+    install = [path / "python", "-m", "pip", "install", "--quiet", built[archive], *constraints]
+    given = {key: text for key, text in os.environ.items() if key != "PYTHONPATH"}
+    given |= {"CHSEL_CACHE_DIR": str(tmp_path / "kernels")}
+    subprocess.run(install, check=True, env=given)
+    (tmp_path / "elsewhere").mkdir()
+    options = {"cwd": tmp_path / "elsewhere", "env": given, "capture_output": True, "text": True}
     box = trimesh.creation.box((0.1, 0.06, 0.2))
-    box.export(tmp_path / "box.stl")
-    np.savez(tmp_path / "points.npz", surface=box.vertices[:6])
+    box.export(tmp_path / "elsewhere" / "box.stl")
+    np.savez(tmp_path / "elsewhere" / "points.npz", surface=box.vertices[:6])
     overrides = ["session=points", "session.path=points.npz", "object=mesh", "object.path=box.stl"]
     overrides += ["method=chsel", "method.descent.restarts=1", "method.emitter.iterations=5"]
-    assert str(site) in ran(sys.executable, "-c", "import runners; print(runners.__file__)").stdout
-    done = ran("chsel-probe", *overrides)
+    done = subprocess.run([path / "chsel-probe", *overrides], **options)
     assert done.returncode == 0, done.stderr
-    (recording,) = tmp_path.glob("logs/probe/*/recording.mcap")
-    info = ran("chsel-replay", "info", str(recording))
-    assert info.returncode == 0, info.stderr
-    mistaken = ran("chsel-replay", "colour=red")
+    (recording,) = tmp_path.glob("elsewhere/logs/probe/*/recording.mcap")
+    stored = REPOSITORY / "tests" / "replays" / "points_default_chsel.mcap"
+    done = subprocess.run([path / "chsel-replay", "verify", recording, stored], **options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    mistaken = subprocess.run([path / "chsel-replay", "colour=red"], **options)
     assert (mistaken.returncode, mistaken.stderr[:7]) == (2, "error: ")
     assert mistaken.stderr.count("\n") == 1
 
