@@ -19,7 +19,7 @@ from replay.mcap.schemas import NUMBERS
 from replay.rerun.archive import ArchiveMap
 from replay.rerun.curves import Curves
 from replay.rerun.decisions import Decisions
-from replay.rerun.scene import HypothesisMeshes, Scene, coarsened
+from replay.rerun.scene import HypothesisMeshes, Scene, coarsened, mode_labels
 from replay.rerun.sensors import SensorImages
 from replay.rerun.stream import Clock, flush, new_stream
 from replay.rerun.text import COLORS, costs_markdown, session_markdown, verdict_markdown
@@ -54,7 +54,7 @@ class RerunRecorder(Recorder):
         self._steered = False
         self._laid_out: object = None  # what the layout was made for
         self._known = 0  # points of known signed distance in the last problem
-        self._costs = ""  # text about the last hypotheses
+        self._costs = self._verdict = ""  # texts about the last hypotheses
 
     def record(self, event: events.Event) -> None:
         """Draw one event."""
@@ -93,9 +93,9 @@ class RerunRecorder(Recorder):
             for name, value in step_numbers(event).items():
                 self._curves.add_measured(name, value)
         if isinstance(event, events.Measured):
-            verdict = verdict_markdown(event.values, self._known)
-            if verdict:
-                self._log_text("result", f"{verdict}\n{self._costs}\n")
+            self._verdict = verdict_markdown(event.values, self._known)
+            if self._verdict:
+                self._log_text("result", f"{self._verdict}\n{self._costs}\n")
 
     @_draw.register
     def _(self, event: events.SessionStarted) -> None:
@@ -168,6 +168,8 @@ class RerunRecorder(Recorder):
     @_draw.register
     def _(self, event: events.Believed) -> None:
         self._scene.show_modes(event)
+        modes = ", ".join(mode_labels(event))
+        self._log_text("result", f"{self._verdict}\n{modes}\n\n{self._costs}\n")
 
     @_draw.register
     def _(self, event: events.Timed) -> None:

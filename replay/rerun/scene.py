@@ -133,16 +133,20 @@ class Scene:
             half_sizes=half_sizes,
             quaternions=quaternions(places[:, :3, :3]),
             colors=[SERIES[number % len(SERIES)] for number in believed.numbers],
-            labels=[
-                f"mode {number}: {100.0 * weight:.0f} %"
-                for number, weight in zip(believed.numbers, believed.weights, strict=True)
-            ],
+            labels=mode_labels(believed),
+            show_labels=False,
         )
         self._stream.log("scene/modes", modes)
 
     def _points(self, name: str, points: FloatArray, color: Rgb, *, size: float) -> None:
         drawn = rr.Points3D(points, colors=[color], radii=on_screen(size))
         self._stream.log(f"scene/{name}", drawn)
+
+
+def mode_labels(believed: Believed) -> list[str]:
+    """The number and weight of each mode."""
+    modes = zip(believed.numbers, believed.weights, strict=True)
+    return [f"mode {number}: {100.0 * weight:.0f} %" for number, weight in modes]
 
 
 def on_screen(radius: float) -> np.ndarray:

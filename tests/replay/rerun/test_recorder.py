@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from chsel.events import (
+    Believed,
     HypothesesFound,
     Measured,
     Probe,
@@ -233,6 +234,21 @@ def test_of_cells_over_a_third_measure_the_lowest_cost_is_shown(tmp_path):
     costs = images(rows["/archive/cost"], 0, np.float32, 1)[-1][..., 0]
     assert costs[2, 0] == 1.0  # cells 0 and 1, of costs 1 and 2
     assert costs[1, 0] == 3.0
+
+
+def test_modes_are_ellipsoids_of_two_deviations_and_their_weights_are_in_the_result(tmp_path):
+    covariance = np.zeros((2, 6, 6))
+    covariance[0, :3, :3] = np.diag([0.04, 0.01, 0.09]) ** 2
+    weights, centres = np.array([0.75, 0.25]), np.array([[0.1, 0.0, 0.2], [0.0, 0.3, 0.1]])
+    poses = np.stack([np.eye(4)] * 2)
+    believed = Believed(0, np.array([5, 2]), weights, poses, centres, covariance, 0.1)
+    drawn = read(write(tmp_path / "a.rrd", [started(), probe(0), *registration(0), believed]))
+    modes = shown_at(drawn["/scene/modes"], 0)
+    np.testing.assert_allclose(modes["Ellipsoids3D:centers"], centres, atol=1e-7)
+    half_sizes = [[0.02, 0.08, 0.18], [5e-4] * 3]
+    np.testing.assert_allclose(modes["Ellipsoids3D:half_sizes"], half_sizes, rtol=1e-6)
+    (text,) = shown_at(drawn["/result"], 0)["TextDocument:text"]
+    assert "mode 5: 75 %, mode 2: 25 %" in text
 
 
 def test_numbers_of_a_step_stand_at_its_probe(rows):
