@@ -141,6 +141,8 @@ class PoseBelief:
         firsts = places[list(hypotheses.trust.best_of_modes)][: self.trust.modes]
         self.numbers: int = 0 if previous is None else previous.numbers  # given to modes so far
         self.modes: list[Mode] = self._modes(firsts, previous)
+        # The last that there were, as results without modes come in between.
+        self._known: list[Mode] = self.modes or ([] if previous is None else previous._known)
 
     def _modes(self, firsts: IntArray, previous: PoseBelief | None) -> list[Mode]:
         """Each member is of the mode whose best is nearest, and not turned against it."""
@@ -161,7 +163,7 @@ class PoseBelief:
 
     def _numbers(self, firsts: IntArray, previous: PoseBelief | None) -> list[int]:
         """Numbers of modes: those of the nearest before, or new ones."""
-        before = [] if previous is None else previous.modes
+        before = [] if previous is None else previous._known
         given: dict[int, int] = {}
         if before:
             old = Poses.of(np.stack([mode.object_from_world for mode in before]))

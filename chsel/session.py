@@ -512,7 +512,7 @@ class Session:
 
         `grasp` and `grasp_chance` are those of the best one, see `PoseBelief.best_grasp`.
         """
-        if self.answer is None or self.trust is None:
+        if self.answer is None or self.answer.trust is None:
             return False
         self.grasp, self.grasp_chance = self.belief.best_grasp(object_from_gripper, width, gripper)
         if self.grasp_chance < sure:

@@ -32,6 +32,7 @@ SCENE: Mapping[str, type[Message]] = {
     "/hypothesis_meshes": SceneUpdate,
     "/hypothesis_surfaces": PointCloud,
     "/next_probe": SceneUpdate,
+    "/modes": SceneUpdate,
     **{f"/all_points/{kind}/{n}": PointCloud for kind in POINT_CLASSES for n in range(LEVELS)},
 }
 """Topics of `viewer_messages` that show the object and all points so far."""

@@ -24,12 +24,12 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 
-from chsel.events import Decided, Event, HypothesesFound, Probe, SessionStarted
+from chsel.events import Believed, Decided, Event, HypothesesFound, Probe, SessionStarted
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.points import KnownPoints
-from chsel.problem.poses import inverse, quaternions
+from chsel.problem.poses import compose, inverse, quaternions
 from chsel.problem.registration_problem import Hypotheses
-from replay.colors import CONTACT, FREE, OCCUPIED, ColorArray, cost_colors
+from replay.colors import CONTACT, FREE, OCCUPIED, SERIES, ColorArray, cost_colors
 from replay.colors import OBJECT as OBJECT_COLOR
 from replay.mcap.foxglove_messages import (
     LEVELS,
@@ -59,6 +59,8 @@ _BEST_OPACITY, _OTHER_OPACITY = 0.9, 0.25
 _SURFACE_POINTS = 100  # of each hypothesis
 _OBJECT = "object"  # the frame
 _ARROW = 0.01  # metres: width of the arrow of the next probe
+_MODE_OPACITY = 0.5
+_LEAST_SIZE = 5e-4  # metres: half an ellipsoid's, to be seen
 _MOST_FACES = 400
 _FINEST, _COARSEST = 40, 4  # cells along the longest side of a mesh's bounds
 _BLOCKS = 8  # that one level of all points holds before they move to the next
@@ -101,6 +103,8 @@ class Views:
                 yield "/hypothesis_surfaces", partial(self._scene.hypothesis_surfaces, *shown)
             case Decided():
                 yield "/next_probe", partial(next_probe, event)
+            case Believed():
+                yield "/modes", partial(modes, event)
 
     def _all_points(self, new: KnownPoints) -> Iterator[View]:
         """The clouds of all points so far that change with new ones."""
@@ -214,6 +218,28 @@ def next_probe(event: Decided, time: int) -> bytes:
             color=Color(r=CONTACT[0] / 255.0, g=CONTACT[1] / 255.0, b=CONTACT[2] / 255.0, a=1.0),
         )
     return serialized(SceneUpdate(entities=[entity]))
+
+
+def modes(event: Believed, time: int) -> bytes:
+    """The ellipsoid of each mode, in a color by its number; nothing for a belief without modes."""
+    entity = SceneEntity(timestamp=stamp(time), id="modes", frame_id=WORLD)
+    places, half_sizes = ellipsoids(event)
+    for pose, size, number in zip(_poses(places), 2.0 * half_sizes, event.numbers, strict=True):
+        r, g, b = (value / 255.0 for value in SERIES[number % len(SERIES)])
+        color = Color(r=r, g=g, b=b, a=_MODE_OPACITY)
+        entity.spheres.add(pose=pose, size=Vector3(x=size[0], y=size[1], z=size[2]), color=color)
+    return serialized(SceneUpdate(entities=[entity]))
+
+
+def ellipsoids(event: Believed) -> tuple[FloatArray, FloatArray]:
+    """Ellipsoids of two standard deviations around the object's centre in each mode.
+
+    Poses world_from_ellipsoid (M, 4, 4), along whose axes the half sizes (M, 3) are, metres.
+    """
+    squares, axes = np.linalg.eigh(event.covariances[:, :3, :3])
+    axes[np.linalg.det(axes) < 0.0] *= -1.0
+    half_sizes = np.maximum(2.0 * np.sqrt(np.maximum(squares, 0.0)), _LEAST_SIZE)
+    return compose(axes, event.centres), half_sizes
 
 
 def object_in_world(world_from_object: FloatArray, time: int) -> bytes:

@@ -28,7 +28,7 @@ from replay.colors import (
     Rgb,
     cost_colors,
 )
-from replay.mcap.viewer_messages import simple_mesh
+from replay.mcap.viewer_messages import ellipsoids, simple_mesh
 
 if TYPE_CHECKING:
     import trimesh
@@ -48,7 +48,6 @@ _ALPHA = (48, 10)  # opacities of the lowest and the highest step, of 255
 _BEST_ALPHA = 150
 _DISPLAY_FACES = 6000  # meshes with more are coarsened for display
 _HAND_ALPHA = 80
-_LEAST_SIZE = 5e-4  # metres: half an ellipsoid's, to be seen
 
 
 class Scene:
@@ -128,12 +127,11 @@ class Scene:
 
     def show_modes(self, believed: Believed) -> None:
         """Where the object's centre is in each mode: its ellipsoid of two standard deviations."""
-        squares, axes = np.linalg.eigh(believed.covariances[:, :3, :3])
-        axes[np.linalg.det(axes) < 0.0] *= -1.0
+        places, half_sizes = ellipsoids(believed)
         modes = rr.Ellipsoids3D(
             centers=believed.centres,
-            half_sizes=np.maximum(2.0 * np.sqrt(np.maximum(squares, 0.0)), _LEAST_SIZE),
-            quaternions=quaternions(axes),
+            half_sizes=half_sizes,
+            quaternions=quaternions(places[:, :3, :3]),
             colors=[SERIES[number % len(SERIES)] for number in believed.numbers],
             labels=[
                 f"mode {number}: {100.0 * weight:.0f} %"

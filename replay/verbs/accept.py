@@ -15,12 +15,21 @@ from pathlib import Path
 from rich.table import Table
 
 from chsel.errors import RecordingError
-from chsel.events import Event, HypothesesFound, Measured, SessionStarted, Timed
+from chsel.events import (
+    Believed,
+    Event,
+    HypothesesFound,
+    Measured,
+    ProblemPosed,
+    SessionStarted,
+    Timed,
+)
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import Hypotheses
 from replay.comparing.again import Again, made_again, result_in
+from replay.comparing.beliefs import Beliefs
 from replay.comparing.comparison import PlausibleSets
 from replay.comparing.verification import DIFFERS, Verdict, recordings_in
 from replay.console import Console, plain_table
@@ -115,14 +124,18 @@ def write_accepted(recording: Recording, path: Path) -> list[ResultChange]:
 
     Registrations follow from today's results; decisions are of the recorded probes, whatever they
     choose. Raises RecordingError if the recording was recovered with losses, behind which E_0 and
-    E_l do not follow from what is left.
+    E_l do not follow from what is left. A recorded belief is that of today's result, too.
     """
     changes: list[ResultChange] = []
     seconds: dict[int, Timed] = {}
     differing, sets = environment_differences(recording.start), PlausibleSets(recording)
+    beliefs = Beliefs(recording)
     with closing(McapRecorder(path)) as recorder:
         for event in made_again(recording, anew=True):
             if isinstance(event, Again):
+                posed = event.today[0] if event.today else None
+                if event.result is not None and isinstance(posed, ProblemPosed):
+                    registered = posed.problem, event.result
                 changes.append(_change(recording, event, sets, differing))
                 seconds[event.step] = Timed(event.step, event.seconds)
                 for inner in event.today or event.recorded:
@@ -137,6 +150,11 @@ def write_accepted(recording: Recording, path: Path) -> list[ResultChange]:
                 event = dataclasses.replace(event, environment=environment())
             elif isinstance(event, Timed):
                 event = seconds.get(event.step, event)
+            elif isinstance(event, Believed):
+                belief = beliefs.after(*registered)
+                if belief is None:
+                    continue
+                event = belief.event(event.step)
             recorder.record(event)
     return changes
 

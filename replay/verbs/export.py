@@ -25,6 +25,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import inverse, quaternions
 from chsel.problem.registration_problem import ArchiveSnapshot
 from replay.arguments import STEPS_HELP, chosen_steps, path_argument
+from replay.comparing.beliefs import Beliefs
 from replay.console import Console
 from replay.files import new_file
 from replay.mcap.event_messages import step_numbers
@@ -240,7 +241,7 @@ def exported_decisions(recording: Recording, steps: str | None) -> Exported:
 
 
 def exported_modes(recording: Recording, steps: str | None) -> Exported:
-    """The modes of each recorded belief.
+    """The modes of each recorded belief; of a recording without one those of each result, computed.
 
     npz: `steps` (S,); of step K `step_K/numbers` (M,), the same for a mode at all steps,
     `step_K/weights` (M,), `step_K/object_from_world` (M, 4, 4), `step_K/centres` (M, 3), of the
@@ -250,6 +251,7 @@ def exported_modes(recording: Recording, steps: str | None) -> Exported:
     m00 to m33 object_from_world.
     """
     told = {e.step: e for e in recording.events(images=False) if isinstance(e, Believed)}
+    told = told or {e.step: e for e in _beliefs(recording)}
     chosen = _chosen(recording, steps, [*told], "belief")
     arrays: dict[str, Any] = {"steps": np.array(chosen, dtype=np.int64)}
     tables = []
@@ -267,6 +269,17 @@ def exported_modes(recording: Recording, steps: str | None) -> Exported:
         }
         tables.append(pd.DataFrame(columns | _entries(parts["object_from_world"])))
     return Exported(arrays.items(), pd.concat(tables))
+
+
+def _beliefs(recording: Recording) -> Iterator[Believed]:
+    """The beliefs of all results that have a pose."""
+    results = [step for step in recording.steps if recording.has_result(step)]
+    beliefs = Beliefs(recording) if results else None
+    for step in results:
+        assert beliefs is not None
+        belief = beliefs.after(recording.problem(step), recording.hypotheses(step))
+        if belief is not None:
+            yield belief.event(step)
 
 
 EXPORTS = {

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from chsel.belief import Gripper
-from chsel.errors import SettingError
-from chsel.numerics.arrays import FloatArray, frozen
+from chsel.errors import ChselError, SettingError
+from chsel.numerics.arrays import FloatArray, frozen, read_npz
 from chsel.problem.poses import nearest_rigid
 from chsel.problem.settings import CheckedSettings, at_most, positive
 
@@ -36,13 +37,16 @@ class GraspConfig(CheckedSettings):
         if self.path is None:
             return None
         try:
-            with np.load(self.path) as file:
-                poses, width = file["object_from_gripper"], file["width"]
-            poses = nearest_rigid("grasp.path", frozen("object_from_gripper", poses, (None, 4, 4)))
-            width = frozen("width", np.broadcast_to(width, len(poses)), (None,))
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            file = read_npz(Path(self.path), error=SettingError)
+            if file.keys() != {"object_from_gripper", "width"}:
+                raise SettingError(f"its arrays are {', '.join(file) or 'none'}")
+            poses = frozen("object_from_gripper", file["object_from_gripper"], (None, 4, 4))
+            poses = nearest_rigid("object_from_gripper", poses)
+            width = frozen("width", np.broadcast_to(file["width"], len(poses)), (None,))
+            if len(poses) == 0 or not width.min() > 0.0:
+                raise SettingError("it has no grasp, or a width that is not above 0")
+        except (ChselError, ValueError) as error:
             accepted = "an .npz file with object_from_gripper (G, 4, 4) and width (G,), metres"
-            why = getattr(error, "strerror", None) or error.args[0]
-            text = f"grasp.path is {self.path} ({why}); accepted: {accepted}"
+            text = f"grasp.path is {self.path} ({error}); accepted: {accepted}"
             raise SettingError(text) from None
         return Grasps(poses, width, self.gripper, self.sure)

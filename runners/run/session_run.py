@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from chsel.belief import Mode
+from chsel.belief import Mode, wilson
 from chsel.events import Logged, Probe, Timed
 from chsel.problem.poses import inverse
 from chsel.registration import Registered
@@ -58,12 +58,10 @@ def steps(
             row |= _numbers(session.registered)
             if belief and session.registered.hypotheses.trust is not None:
                 row["belief"] = [_mode(mode) for mode in session.belief.modes]
-        if grasps and session.registered and session.grasped(*grasps):
-            row["stop"] = session.stop
-        elif session.steering is not None:
+            if grasps is not None and session.registered.hypotheses.trust is not None:
+                row |= _grasp(session, grasps)
+        if session.steering is not None:
             row |= _decide(session, source)
-        if session.grasp is not None:
-            row |= {"grasp_chance": session.grasp_chance, "grasp": session.grasp.tolist()}
         text = f"probe {session.step}: {row['outcome']}, {row['contacts']} contacts"
         if "digest" not in row:
             text += ", too little for a registration"
@@ -99,6 +97,15 @@ def _mode(mode: Mode) -> Row:
     return numbers | {"position_deviation": position, "rotation_deviation": rotation}
 
 
+def _grasp(session: Session, grasps: Grasps) -> Row:
+    """The best grasp, its chance with a 90 % interval, and that the session ends if it does."""
+    stop = {"stop": session.stop} if session.grasped(*grasps) else {}
+    assert session.grasp is not None
+    _, lower, upper = wilson(session.grasp_chance, len(session.belief))
+    row: Row = {"grasp": session.grasp.tolist(), "grasp_chance": session.grasp_chance}
+    return row | {"grasp_chance_interval": [float(lower), float(upper)]} | stop
+
+
 def _events(session: Session, source: ProbeSource) -> Iterator[ProbeEvent]:
     """What a source yields, in its own order or as the session steers it."""
     if session.steering is None:
@@ -116,8 +123,10 @@ def _decide(session: Session, source: ProbeSource) -> Row:
     assert isinstance(source, Steerable)
     assert session.steering is not None
     before = session.steering.last
-    decision, surprise = session.decide(source.available()).decision, session.steering.surprise
-    row: Row = {"spread": decision.spread, "stop": decision.stop, "surprise": surprise}
+    row: Row = {"surprise": session.steering.surprise}
+    if session.stop != "grasp":
+        decision = session.decide(source.available()).decision
+        row |= {"spread": decision.spread, "stop": decision.stop}
     if before is not None:
         chosen = before.decision.chosen
         row["action"] = chosen

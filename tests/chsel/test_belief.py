@@ -60,12 +60,17 @@ def test_modes_have_weights_covariances_and_numbers_that_stay():
     np.testing.assert_allclose(belief.modes[0].covariance[3:, 3:], expected[3:, 3:], atol=1e-9)
     np.testing.assert_allclose(belief.modes[0].covariance[:3, :3], expected[:3, :3], atol=1e-7)
     assert not belief.modes[1].covariance.any()
+    roots = np.sqrt((steps[:30].reshape(-1, 2, 3) ** 2).sum(axis=2).mean(axis=0))
+    assert belief.modes[0].deviations == pytest.approx(roots, rel=0.01)
     # Best first the other one, and a third place: numbers stay with their places.
     far = shifted(np.array([[0.0, 0.5, 0.0]]), about=here)
     later = np.concatenate([second[None], first[:1], far])
     again = PoseBelief(L_GRID, result(later, (0, 1, 2)), previous=belief)
     assert [mode.number for mode in again.modes] == [1, 0, 2]
-    assert PoseBelief(L_GRID, result(poses, verdict="wide")).modes == []
+    wide = PoseBelief(L_GRID, result(poses, verdict="wide"), previous=again)
+    assert wide.modes == []
+    after = PoseBelief(L_GRID, result(later, (0, 1, 2)), previous=wide)
+    assert [mode.number for mode in after.modes] == [1, 0, 2]
 
 
 @pytest.mark.parametrize("mesh", [BOX, trimesh.creation.cylinder(0.03, 0.1)])

@@ -142,20 +142,3 @@ def test_printed_numbers_are_those_of_all_presets():
     for preset in ORDER:
         settings = dict(flat(settings_mapping(settings_of("chsel", preset))))
         assert {name: settings[name] for name in printed} == pytest.approx(printed)
-
-
-def table_rows(text):
-    lines = [line for line in text.splitlines() if re.fullmatch(r"\|.*[^-|: ].*\|", line)]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-
-
-def test_times_in_the_readme_are_those_of_the_page_of_the_benchmark():
-    readme = (REPOSITORY / "README.md").read_text()
-    header, *rows = table_rows(readme.partition("\n## Speed\n")[2].partition("\n## ")[0])
-    measured = {(row[0], row[1]): row[2] for row in table_rows((DOCS / "speed.md").read_text())}
-    assert len(rows) >= 4
-    for row in rows:
-        (problem,) = re.findall("`(.*)`", row[0])
-        for column, cell in zip(header[1:], row[1:], strict=True):
-            name = column.replace("`", "")
-            assert cell == measured.get((problem, name), ""), f"{problem}, {column}"

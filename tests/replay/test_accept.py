@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.events import ListRecorder, Measured, ProblemPosed, RigDescribed, SensorImage
+from chsel.events import Believed, ListRecorder, Measured, ProblemPosed, RigDescribed, SensorImage
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem import online_registration as online
 from chsel.problem.points import KnownPoints, Workspace
@@ -68,6 +68,21 @@ def test_todays_results_are_those_that_verify_then_expects(stored, capsys):
         assert accepted.problem(step).points.digest == recorded.problem(step).points.digest
     assert not np.array_equal(accepted.problem(9).initial_set, recorded.problem(9).initial_set)
     assert list(stored.parent.iterdir()) == [stored]
+
+
+@pytest.mark.usefixtures("other_code")
+def test_a_recorded_belief_becomes_that_of_todays_result(stored, write, tmp_path):
+    events = list(read_recording(stored).events())
+    (place,) = [n for n, e in enumerate(events) if isinstance(e, Measured) and e.step == 9]
+    shapes = (0,), (0, 4, 4), (0, 3), (0, 6, 6)
+    stale = Believed(9, np.zeros(0, dtype=np.int64), *map(np.zeros, shapes), 0.5)
+    path = write([*events[: place + 1], stale, *events[place + 1 :]])
+    write_accepted(read_recording(path), tmp_path / "new.mcap")
+    today = list(read_recording(tmp_path / "new.mcap").events())
+    (believed,) = [event for event in today if isinstance(event, Believed)]
+    measured = [event for event in today if isinstance(event, Measured) and event.step == 9]
+    assert [believed.spread] == [event.values["set_spread"] for event in measured]
+    assert measured[0].values["set_spread"] != events[place].values["set_spread"]
 
 
 @pytest.mark.usefixtures("other_code")

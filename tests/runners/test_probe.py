@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 
 import chsel
 from chsel.errors import MeshError
-from chsel.events import Logged, Measured
+from chsel.events import Believed, Logged, Measured
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import object_symmetry
+from replay.comparing.beliefs import Beliefs
 from replay.mcap.reader import read_recording
 from runners import probe
 from runners.command.choices import CONF
@@ -84,6 +85,19 @@ def test_trust_is_on_the_terminal_in_the_summary_and_in_the_log(finished):
     assert table[0].split()[:2] == ["0", "5"]
     shown = " ".join(done.stdout.split())
     assert shown.rpartition(f"{trusts[2]}: ")[2] in set(MEANINGS.values())
+
+
+def test_recorded_beliefs_follow_from_the_recorded_results(finished):
+    recording = read_recording(finished[0] / "recording.mcap")
+    told = [event for event in recording.events() if isinstance(event, Believed)]
+    assert [event.step for event in told] == [0, 1, 2]
+    beliefs = Beliefs(recording)
+    for event in told:
+        problem, found = recording.problem(event.step), recording.hypotheses(event.step)
+        again = beliefs.after(problem, found).event(event.step)
+        assert vars(again).keys() == vars(event).keys()
+        for name, value in vars(again).items():
+            np.testing.assert_array_equal(value, getattr(event, name))
 
 
 def shown_pose(done, step):

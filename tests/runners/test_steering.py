@@ -3,11 +3,13 @@ import json
 import numpy as np
 import pytest
 
+from chsel.errors import SettingError
 from chsel.events import Believed, Decided, Probe
 from chsel.policies.steering import Steering
 from replay.comparing.verification import EQUAL, verify
 from replay.mcap.reader import read_recording
 from runners import probe
+from runners.run.grasps import GraspConfig
 from tests.runners.in_process import run
 
 SESSION = ("object=spam_can", "session=kinematic", "method=anchored", "method.size=small")
@@ -75,20 +77,45 @@ def test_a_session_ends_with_a_sure_grasp_and_says_how_sure_it_is_of_each_mode(t
     assert "stopped: a grasp works with a chance of" in done.stdout
     last = summary["steps"][-1]
     assert last["stop"] == "grasp"
-    assert last["grasp_chance"] >= 0.95
+    assert last["grasp_chance"] == 1.0
+    # Wilson's interval of n successes in n trials is from n / (n + z^2) to 1.
+    lower, upper = last["grasp_chance_interval"]
+    trials = lower / (1.0 - lower) * 1.6449**2
+    assert (trials, upper) == pytest.approx((round(trials), 1.0))
+    assert 1 < trials < 31
+    assert last["action"] == decided(recording)[-1].decision.chosen
     assert all(row.get("grasp_chance", 0.0) < 0.95 for row in summary["steps"][:-1])
     believed = [event for event in recording.events() if isinstance(event, Believed)]
     assert [event.step for event in believed] == list(recording.steps)
     for row, event in zip(summary["steps"][-len(believed) :], believed, strict=True):
         assert [mode["weight"] for mode in row["belief"]] == event.weights.tolist()
     assert {verdict.outcome for verdict in verify(recording)} == {EQUAL}
-    np.savez(file, object_from_gripper=down[None])
-    done = run(probe.main, *SESSION, *grasp, f"logs={tmp_path}")
-    assert done.returncode == 2
-    assert done.stderr == (
-        f"error: grasp.path is {file} (width is not a file in the archive); accepted: an .npz file "
-        "with object_from_gripper (G, 4, 4) and width (G,), metres\n"
-    )
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        (None, "not a readable .npz file (File is not a zip file)"),
+        ({"object_from_gripper": np.eye(4)[None]}, "its arrays are object_from_gripper"),
+        ({"object_from_gripper": np.eye(4), "width": 0.1}, "object_from_gripper has shape (4, 4)"),
+        ({"object_from_gripper": np.ones((1, 4, 4)), "width": 0.1}, "object_from_gripper[0] is no"),
+        ({"object_from_gripper": np.eye(4)[None], "width": [0.1, 0.1]}, "broadcast"),
+        ({"object_from_gripper": np.eye(4)[None], "width": 0.0}, "a width that is not above 0"),
+        ({"object_from_gripper": np.zeros((0, 4, 4)), "width": 0.1}, "it has no grasp"),
+    ],
+)
+def test_a_mistake_in_a_file_of_grasps_is_one_line(arrays, message, tmp_path):
+    file = tmp_path / "grasps.npz"
+    if arrays is None:
+        file.write_bytes(b"half")
+    else:
+        np.savez(file, **arrays)
+    with pytest.raises(SettingError) as caught:
+        GraspConfig(path=str(file)).grasps()
+    text = str(caught.value)
+    assert text.startswith(f"grasp.path is {file} (")
+    assert text.endswith("with object_from_gripper (G, 4, 4) and width (G,), metres")
+    assert message in text
 
 
 def test_a_surprise_starts_the_next_registration_afresh(tmp_path, monkeypatch):

@@ -158,10 +158,13 @@ def main():
             console.print(f"error: {' '.join(tests)} fail as they are; accepted: tests that pass")
             return 2
         longest = 3.0 * (time.monotonic() - begun) + 60.0  # kernels are compiled again
-        noticed = 0
-        for number, (file, operator, occurrence) in enumerate(chosen, 1):
+        noticed = number = 0
+        for file, operator, occurrence in chosen:
             code = (ROOT / file).read_text()
             mutant = changed(code, operator, occurrence)
+            if mutant == code:  # Cosmic Ray has such
+                continue
+            number += 1
             (folder / file).write_text(mutant)
             survived = passes(folder, tests, longest)
             (folder / file).write_text(code)
@@ -173,8 +176,8 @@ def main():
                 console.print(f"[red]not noticed[/]: {file}")
                 console.print(*list(lines)[2:], sep="\n", markup=False)
             console.print(f"{noticed} of {number} noticed", style="dim")
-    share = 100.0 * noticed / len(chosen)
-    console.print(f"{arguments.room}: {noticed} of {len(chosen)} of {len(mutants)}, {share:.0f} %")
+    share = 100.0 * noticed / max(number, 1)
+    console.print(f"{arguments.room}: {noticed} of {number} of {len(mutants)}, {share:.0f} %")
     return 0
 
 

@@ -4,8 +4,6 @@ import io
 
 import numpy as np
 import pytest
-import trimesh
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC, Writer
 
@@ -14,7 +12,6 @@ from chsel.events import ProblemPosed
 from replay.mcap.encoding import decode, encode, message_class
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import FORMAT_VERSION, RECORDS
-from tests.replay.conftest import nth
 
 
 def rewritten(path, change):
@@ -80,62 +77,6 @@ def test_problems_are_rebuilt_from_the_file_alone(events, write):
         recording.problem(0)
     with pytest.raises(RecordingError, match="no result of step 7; accepted: 1, 2"):
         recording.hypotheses(7)
-
-
-def test_plain_mcap_and_protobuf_rebuild_a_problem(events, write):
-    """Without any code of this project: the file describes itself."""
-    with write(events).open("rb") as file:
-        reader = make_reader(file, validate_crcs=True)
-        summary = reader.get_summary()
-        attachments = {item.name: item.data for item in reader.iter_attachments()}
-        stored = [(c.topic, s.name, m) for s, c, m in reader.iter_messages()]
-    pool = descriptor_pool.DescriptorPool()
-    for schema in summary.schemas.values():
-        for proto in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
-            pool.Add(proto)
-
-    def parsed(name, data):
-        return message_factory.GetMessageClass(pool.FindMessageTypeByName(name)).FromString(data)
-
-    def array(message):
-        stored = np.frombuffer(message.data, message.dtype).reshape(tuple(message.shape))
-        return stored.astype(np.float64)  # a grid may be stored in 32 bits
-
-    points, elites = {"free": [], "occupied": [], "known": []}, None
-    for topic, name, message in stored:
-        content = parsed(name, message.data)
-        if topic.startswith("/points/"):
-            columns = content.point_stride // 8
-            points[topic[8:]].append(np.frombuffer(content.data, "<f8").reshape(-1, columns))
-        if topic == "/hypotheses":
-            elites = array(content.elites)
-        if topic == "/problem" and content.step == 2:
-            break
-    low_cost_set = array(content.low_cost_set) if content.HasField("low_cost_set") else elites
-    grid = parsed("chsel.SdfGrid", attachments["sdf_grid"])
-    expected = nth(events, ProblemPosed, 1).problem
-    known = np.concatenate(points["known"])
-    for found, wanted in (
-        (np.concatenate(points["free"]), expected.points.free),
-        (np.concatenate(points["occupied"]), expected.points.occupied),
-        (known[:, :3], expected.points.known),
-        (known[:, 3], expected.points.sdf),
-        (array(content.initial_set), expected.initial_set),
-        (low_cost_set, expected.low_cost_set),
-        (array(content.workspace), expected.workspace.bounds),
-        (array(grid.values), expected.sdf.values),
-        (array(grid.gradients), expected.sdf.gradients),
-        (array(grid.origin), expected.sdf.origin),
-    ):
-        assert found.shape == wanted.shape
-        assert found.tobytes() == wanted.tobytes()
-    assert grid.resolution == expected.sdf.resolution
-    assert (content.key_seed, content.key_step) == (expected.key.seed, expected.key.step)
-    assert content.free_resolution == expected.free_resolution
-    assert content.digest == expected.digest
-    mesh = trimesh.load(io.BytesIO(attachments["mesh.ply"]), file_type="ply", process=False)
-    assert mesh.vertices.tobytes() == events[0].mesh.vertices.tobytes()
-    assert mesh.faces.tolist() == events[0].mesh.faces.tolist()
 
 
 def test_other_files_are_refused(tmp_path):

@@ -9,11 +9,11 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 
-from chsel.events import Decided, HypothesesFound, Probe
-from chsel.problem.poses import inverse, rotation_matrices
+from chsel.events import Believed, Decided, HypothesesFound, Probe
+from chsel.problem.poses import axis_angle, inverse, rotation_matrices
 from replay.mcap.foxglove_messages import POINT_CLASSES, VIEWS
 from replay.mcap.schemas import STEP_TIME
-from replay.mcap.viewer_messages import next_probe
+from replay.mcap.viewer_messages import modes, next_probe
 from tests.replay.conftest import example_events, nth
 
 
@@ -96,6 +96,25 @@ def test_the_next_probe_is_an_arrow_from_start_to_end(steered_events):
     assert np.isclose(arrow.shaft_length + arrow.head_length, length)
     (entity,) = SceneUpdate.FromString(next_probe(last, 5)).entities
     assert len(entity.arrows) == 0
+
+
+def test_modes_are_ellipsoids_of_two_standard_deviations():
+    turn = axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7))
+    covariances = np.zeros((2, 6, 6))
+    covariances[0, :3, :3] = turn @ np.diag([0.01, 0.02, 0.03]) ** 2 @ turn.T
+    centres, poses = np.array([[0.1, 0.2, 0.3], [0.0, 0.0, 0.5]]), np.stack([np.eye(4)] * 2)
+    believed = Believed(3, np.array([4, 0]), np.array([0.9, 0.1]), poses, centres, covariances, 0.1)
+    (entity,) = SceneUpdate.FromString(modes(believed, 5)).entities
+    first, second = entity.spheres
+    size, position, q = first.size, first.pose.position, first.pose.orientation
+    np.testing.assert_allclose([size.x, size.y, size.z], [0.04, 0.08, 0.12])
+    np.testing.assert_allclose([position.x, position.y, position.z], centres[0])
+    axes = rotation_matrices(np.array([[q.x, q.y, q.z, q.w]]))[0]
+    np.testing.assert_allclose(np.abs(axes.T @ turn), np.eye(3), atol=1e-7)
+    assert [second.size.x, second.size.y, second.size.z] == [0.001] * 3
+    nothing = Believed(4, *(part[:0] for part in list(vars(believed).values())[1:6]), 0.1)
+    (entity,) = SceneUpdate.FromString(modes(nothing, 6)).entities
+    assert (entity.id, len(entity.spheres)) == ("modes", 0)  # in place of those before
 
 
 def test_poses_and_the_true_pose_are_there_to_the_bit(events, write):

@@ -1,0 +1,36 @@
+"""What recorded results mean, computed from the results themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from chsel.belief import PoseBelief
+from chsel.methods import noise_of, trust_by
+from chsel.plausible.symmetry import object_symmetry
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from replay.comparing.choices import recorded_method
+from replay.mcap.reader import Recording
+
+
+class Beliefs:
+    """Beliefs of results of one session, in their order; modes keep their numbers."""
+
+    def __init__(self, recording: Recording) -> None:
+        """Raises RecordingError if the recording does not have the settings of its method."""
+        self._method, self._start = recorded_method(recording).build(), recording.start
+        self._last: PoseBelief | None = None
+
+    def after(self, problem: RegistrationProblem, found: Hypotheses) -> PoseBelief | None:
+        """What is believed after one more result; None for one without a pose."""
+        trust = trust_by(self._method, problem, found)
+        if trust is None:
+            return None
+        self._last = PoseBelief(
+            self._start.sdf,
+            replace(found, trust=trust),
+            object_symmetry(self._start.mesh),
+            self._last,
+            problem=problem,
+            noise=noise_of(self._method),
+        )
+        return self._last
