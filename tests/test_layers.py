@@ -1,5 +1,3 @@
-"""Who may import whom."""
-
 import ast
 import re
 from collections import Counter

@@ -1,5 +1,3 @@
-"""The loop of Algorithm 2, E_0 and E_l."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Which of several objects it is, told by contacts on one of them."""
-
 import numpy as np
 import pytest
 import trimesh

@@ -21,7 +21,7 @@ from chsel.problem.streams import StreamKey
 from chsel.registration import register_recorded
 from replay.__main__ import main
 from replay.mcap.reader import read_recording
-from replay.verbs.accept import write_accepted
+from replay.verbs.accept import best_pose_moves, write_accepted
 from tests.replay.conftest import same_bits
 from tests.tools.small_recordings import robot_session
 
@@ -162,3 +162,10 @@ def test_recorded_errors_are_modulo_the_symmetries_of_the_object_at_its_centre()
     assert measured.values["best_rotation_error"] == pytest.approx(0.0, abs=1e-6)
     assert measured.values["closest_position_error"] == pytest.approx(0.0, abs=1e-9)
     assert measured.values["closest_rotation_error"] == pytest.approx(np.deg2rad(10.0), abs=1e-6)
+
+
+def test_how_far_the_best_pose_moves():
+    pair, symmetry = (found(turned(180.0)), found(turned(20.0, 0.004))), object_symmetry(BOX)
+    moves = 0.004, pytest.approx(np.deg2rad(20.0), abs=1e-6)
+    assert best_pose_moves(*pair, symmetry) == (pytest.approx(moves[0], abs=1e-9), moves[1])
+    assert np.isnan(best_pose_moves(pair[0], found(), symmetry)).all()

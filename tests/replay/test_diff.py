@@ -6,11 +6,7 @@ import re
 
 import numpy as np
 
-from chsel.events import (
-    HypothesesFound,
-    Measured,
-    Traced,
-)
+from chsel.events import HypothesesFound, Measured, Traced
 from replay.__main__ import main
 from replay.verbs.diff import FIRST, SECOND, recording_diff
 from tests.replay.conftest import changed, nth

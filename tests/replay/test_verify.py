@@ -10,7 +10,7 @@ import pytest
 
 from chsel.events import HypothesesFound, Measured, SessionStarted, Traced
 from replay.__main__ import main
-from replay.comparing.differences import is_close
+from replay.comparing.differences import is_close, ulps
 from replay.comparing.verification import DIFFERS, EQUAL, NO_RESULT, verified_files, verify
 from replay.mcap.reader import read_recording
 from tests.replay.conftest import changed, nth
@@ -166,3 +166,9 @@ def test_what_cannot_be_verified_is_one_line_and_status_2(arguments, message, ca
     assert shown.startswith("error: ")
     assert message in shown
     assert shown.count("\n") == 1
+
+
+def test_ulps_count_the_numbers_between():
+    left = np.array([1.0, 0.0, -0.0, 5e-324, -1.0, 1.5])
+    right = np.array([1.0 + 2.0**-51, -0.0, 5e-324, -5e-324, -1.0 - 2.0**-52, 1.5])
+    assert ulps(left, right).tolist() == [2, 1, 2, 3, 1, 0]

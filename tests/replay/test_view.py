@@ -1,5 +1,3 @@
-"""view and info."""
-
 import os
 import re
 import signal
@@ -83,7 +81,6 @@ def test_the_web_viewer_is_served_here_alone_and_ends_with_the_command(
     environment |= {"TMPDIR": str(folder), "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as viewing:
         try:
-            assert viewing.stdout is not None
             address = viewing.stdout.readline().strip()
             page, data = map(int, re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", address))
             with urllib.request.urlopen(f"http://127.0.0.1:{page}/") as answer:

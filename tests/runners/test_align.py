@@ -1,5 +1,3 @@
-"""The command that finds where the object of real data is, as a user runs it."""
-
 import shutil
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Evaluations on workers elsewhere, and sweeps by launchers."""
-
 import asyncio
 import importlib.util
 import json

@@ -1,5 +1,3 @@
-"""The command that evaluates methods, as a user runs it."""
-
 import json
 import os
 import re

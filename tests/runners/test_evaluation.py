@@ -1,5 +1,3 @@
-"""The tasks of an evaluation, and its folder."""
-
 import json
 import os
 import signal
@@ -28,17 +26,8 @@ from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.metrics import MetricsConfig
 from runners.evaluation.plan import OWN, Plan, Task, Trial
 from runners.evaluation.run_method import ResultRows, read_external
-from runners.evaluation.tasks import (
-    connected,
-    do_tasks,
-    is_finished,
-    tasks_of,
-)
-from runners.evaluation.trial_configurations import (
-    chosen_names,
-    chosen_seeds,
-    configurations_of,
-)
+from runners.evaluation.tasks import connected, do_tasks, is_finished, tasks_of
+from runners.evaluation.trial_configurations import chosen_names, chosen_seeds, configurations_of
 from runners.evaluation.trial_session import open_recorded, problems
 from runners.sessions.probing_settings import ProbingSettings
 from tests.runners.in_process import do_task
@@ -318,7 +307,6 @@ def test_a_session_with_faults_is_measured_by_the_plausible_sets_of_that_without
     start, truth = recording.start, recording.start.world_from_object
     assert start.config["session"]["faults"]["contact_noise"] == 0.003
     without = read_recording(TRIAL.folder(plan) / "session.mcap").start
-    assert truth is not None
     np.testing.assert_array_equal(truth, without.world_from_object)
     np.testing.assert_allclose(asked[0][0] @ truth, np.eye(4), atol=1e-12)
     found, symmetry = recording.hypotheses(5).object_from_world, object_symmetry(start.mesh)

@@ -1,5 +1,3 @@
-"""Sessions whose object moves when it is touched."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""runners.plausible, and definitions of plausible sets."""
-
 import os
 
 import numpy as np
@@ -60,7 +58,6 @@ def test_a_recording_gets_its_sets_and_its_hypotheses_are_measured(folder):
     for step in recording.steps:
         problem = recording.problem(step)
         stored = load_plausible(folder / "plausible", problem, settings, world_from_object=POSE)
-        assert stored is not None
         assert stored.digest == plausible_set(problem, POSE, settings).digest
         assert stored.local.any()
         cells = rows(done.stdout)[step]

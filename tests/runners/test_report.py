@@ -173,7 +173,6 @@ def test_pd_over_probes_is_the_median_and_quartiles_of_each_object_and_step(tmp_
     styles = styles_of(["chsel", "icp"])
     evaluation = open_evaluation(write_evaluation(tmp_path, rows))
     picture = pd_over_probes("pd", evaluation.rows, styles)
-    assert picture is not None
     assert [axes.get_title() for axes in picture.figure.axes] == ["box", "can"]
     drawn = picture.data[picture.data["object"] == "can"].drop(columns="object")
     assert drawn.to_numpy().tolist() == [
@@ -195,7 +194,6 @@ def test_each_panel_over_iterations_draws_its_own_number_and_costs_of_one_kind(t
     ]
     folder = write_evaluation(tmp_path, [], moments, methods=methods)
     section = sections_of(open_evaluation(folder))[1]
-    assert section.picture is not None
     data = section.picture.data.set_index(["number", "method", "iteration"]).sort_index()
     values = ["lower", "median", "upper"]
     for method in methods:

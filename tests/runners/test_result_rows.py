@@ -41,11 +41,9 @@ def scene(tmp_path_factory):
     assert do_task(plan, Task(TRIAL)) == ""
     session = open_recorded(plan, TRIAL)
     truth = session.world_from_object
-    assert truth is not None
     rows = ResultRows(plan, TRIAL, session, "made_up")
     problem = list(problems(plan, TRIAL, session))[-1]
     members, _ = rows.members(problem)
-    assert members is not None
     cost = EvaluationCost(problem, plan.plausible_settings(EPSILON).cost)
     return Scene(rows, session, truth, problem, members, cost)
 

@@ -18,13 +18,7 @@ from runners.command.choices import CONF
 from runners.evaluation.plan import Task, Trial
 from runners.evaluation.trial_configurations import chosen_names, configurations_of
 from runners.evaluation.trial_session import open_recorded, read_told
-from runners.evaluation.true_poses import (
-    TRUTH,
-    as_set_by_hand,
-    check_log,
-    guessed_pose,
-    is_missing,
-)
+from runners.evaluation.true_poses import TRUTH, as_set_by_hand, check_log, guessed_pose, is_missing
 from runners.sensors.pose_file import beside, read_pose, write_pose
 from tests.runners.in_process import do_task, run
 from tests.runners.test_evaluation import plan_in
@@ -130,10 +124,7 @@ def test_a_pose_set_by_hand_is_near_the_truth_but_not_it():
     ("arguments", "message"),
     [
         (("session=kinematic", "session.logs=LOGS"), "session.logs is for session=sensors"),
-        (
-            ("session=sensors", "session.logs=LOGS", "seeds=0"),
-            "no seed_0.pose.yaml beside it",
-        ),
+        (("session=sensors", "session.logs=LOGS", "seeds=0"), "no seed_0.pose.yaml beside it"),
         (("session=sensors", "session.logs=LOGS", "seeds=4"), "seed_4.mcap; accepted: seeds"),
     ],
 )
@@ -162,7 +153,6 @@ def test_a_trial_gets_its_log_its_true_pose_and_its_results(tmp_path, monkeypatc
     truth = read_pose(log.with_name(f"seed_0{TRUTH}"))
     recording = read_recording(trial.folder(plan) / "session.mcap")
     found = recording.start.world_from_object
-    assert found is not None
     assert np.abs(found[:3, 3] - as_set_by_hand(truth)[:3, 3]).max() < 0.035
     assert any(isinstance(event, RigDescribed) for event in recording.events())
     assert str(tmp_path) not in json.dumps(dict(recording.start.config))

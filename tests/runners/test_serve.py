@@ -1,5 +1,3 @@
-"""Sessions that other programs use: python -m runners.serve."""
-
 import asyncio
 import base64
 import json

@@ -1,5 +1,3 @@
-"""The command that simulates a robot's log, as a user runs it."""
-
 import numpy as np
 import pytest
 import yaml
@@ -79,7 +77,6 @@ def test_the_rig_of_the_cabinet_describes_the_twin():
     assert rig.world == WORLD
     assert rig.box().lower == CABINET_WORKSPACE.lower
     assert rig.box().upper == CABINET_WORKSPACE.upper
-    assert rig.hand is not None
     assert rig.hand.frame == WRIST
     for box, part in zip(rig.hand.boxes, rigid_parts(), strict=True):
         assert np.allclose(box.size, part.size)

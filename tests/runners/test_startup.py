@@ -1,5 +1,3 @@
-"""The first moments of a command."""
-
 import importlib
 import os
 import signal

@@ -1,5 +1,3 @@
-"""Sessions whose probes a policy chooses, as a user runs them."""
-
 import json
 
 import numpy as np

@@ -94,7 +94,6 @@ def test_a_forward_lattice_keeps_its_start_and_length():
     assert len(actions) == 12 * 12
     np.testing.assert_array_equal(actions.world_from_hand[:, 0, 3], -0.05)
     np.testing.assert_array_equal(actions.length, 0.3)
-    assert actions.seconds is not None
     np.testing.assert_allclose(actions.seconds, 2.0 + 2.0 * 0.3 / 0.1)
     assert corners(actions, 0.0)[..., 2].min() == pytest.approx(CLEARANCE)
 

@@ -20,14 +20,7 @@ from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.streams import StreamKey
-from tests.chsel.next_probe.decisions import (
-    RADIUS,
-    WORKSPACE,
-    along_x,
-    at,
-    ball,
-    ball_problem,
-)
+from tests.chsel.next_probe.decisions import RADIUS, WORKSPACE, along_x, at, ball, ball_problem
 
 NOISE = 0.005
 PLACES = [(0.0, 0.0), (0.06, 0.0), (-0.05, 0.03), (0.0, -0.1), (0.28, 0.28)]

@@ -9,10 +9,7 @@ from scipy.spatial.transform import Rotation
 from chsel.errors import SdfError, SettingError
 from chsel.numerics.threads import threads
 from chsel.plausible.evaluation_cost import EvaluationCost
-from chsel.plausible.plausible_set import (
-    plausible_set,
-    stepped,
-)
+from chsel.plausible.plausible_set import plausible_set, stepped
 from chsel.plausible.plausible_settings import (
     EvaluationCostSettings,
     ModeSearchSettings,

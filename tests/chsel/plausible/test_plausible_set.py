@@ -287,7 +287,6 @@ def test_a_set_is_read_as_it_was_written_and_named_by_its_points(made, tmp_path)
     assert path == plausible_path(tmp_path / "sets", problem, SETTINGS)
     assert [file.name for file in path.parent.iterdir()] == [path.name]
     read = load_plausible(path.parent, problem, SETTINGS, world_from_object=truth)
-    assert read is not None
     assert read.digest == found.digest
     assert (read.settings, read.seed) == (SETTINGS, 7)
     assert read.true_cost == found.true_cost

@@ -1,5 +1,3 @@
-"""Pose errors modulo symmetries, at the object's centre."""
-
 import numpy as np
 import pytest
 import trimesh

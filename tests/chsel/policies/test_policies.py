@@ -1,5 +1,3 @@
-"""Policies."""
-
 from dataclasses import replace
 
 import numpy as np

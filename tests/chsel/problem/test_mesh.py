@@ -1,5 +1,3 @@
-"""Meshes are merged and checked at the border."""
-
 import warnings
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Poses, search spaces and the choice of few of many."""
-
 import numpy as np
 import pytest
 import torch

@@ -10,13 +10,7 @@ import trimesh
 
 import chsel
 from chsel.errors import PoseError, SettingError
-from chsel.problem.noise import (
-    LIMIT,
-    PRIOR_CONTACTS,
-    PRIOR_OUTLIERS,
-    estimate_noise,
-    noise_model,
-)
+from chsel.problem.noise import LIMIT, PRIOR_CONTACTS, PRIOR_OUTLIERS, estimate_noise, noise_model
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import VERDICTS, RegistrationProblem
 from chsel.problem.streams import StreamKey

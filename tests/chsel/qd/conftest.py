@@ -1,5 +1,3 @@
-"""What several tests of the library share."""
-
 from typing import Any
 
 import numba

@@ -1,5 +1,3 @@
-"""The archive and both emitters against pyribs."""
-
 from functools import partial
 from typing import Any, NamedTuple
 

@@ -1,5 +1,3 @@
-"""Cameras, reliable pixels, and regions."""
-
 import numpy as np
 import pytest
 

@@ -49,7 +49,6 @@ def recorded(path, events, *flush_before):
 def chunks_of(data, topic=None):
     """Start and end of every chunk, or of those with messages on a topic."""
     summary = make_reader(io.BytesIO(data)).get_summary()
-    assert summary is not None
     channels = {c.id for c in summary.channels.values() if topic in (None, c.topic)}
     return [
         (index.chunk_start_offset, index.chunk_start_offset + index.chunk_length)

@@ -103,11 +103,7 @@ def test_what_cannot_be_recorded_leaves_a_whole_file_of_all_before_it(
             ProblemPosed(1, dataclasses.replace(problem, points=extra)),
             "problem of step 1 has points",
         ),
-        (
-            posed + 1,
-            HypothesesFound(1, narrow),
-            r"Hypotheses\.cell .* int32 \(5,\); .*int64 \(5\)",
-        ),
+        (posed + 1, HypothesesFound(1, narrow), r"Hypotheses\.cell .* int32 \(5,\); .*int64 \(5\)"),
         (posed + 1, HypothesesFound(1, short), "step 1: it has a value of another shape or type"),
     ):
         path = tmp_path / "recording.mcap"

@@ -1,5 +1,3 @@
-"""The comparison of methods, read back with Rerun's own reader."""
-
 import numpy as np
 import pytest
 

@@ -108,10 +108,7 @@ def registration(step, *, shape=(4, 3)):
         yield SnapshotTaken(step, snapshot(iteration, shape))
         yield Traced(step, "quality_diversity", iteration, "0", 0.5, 1.0, 2.0)
     yield HypothesesFound(step, hypotheses(snapshot(5, shape)))
-    errors = {
-        "best_position_error": 0.01 * (step + 1),
-        "best_rotation_error": 0.5 * (step + 1),
-    }
+    errors = {"best_position_error": 0.01 * (step + 1), "best_rotation_error": 0.5 * (step + 1)}
     yield Measured(step, {**errors, "coverage_mm2": 4.0, "set_spread": 0.003})
     yield Timed(step, {"gradient_descent": 0.25})
 

@@ -1,5 +1,3 @@
-"""Models of objects, and scans."""
-
 import io
 import tarfile
 from pathlib import Path

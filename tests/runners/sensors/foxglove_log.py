@@ -25,7 +25,6 @@ def in_foxgloves_messages(source, target, *, packed):
         channels: dict[str, int] = {}
         messages = make_reader(read, decoder_factories=[DecoderFactory()])
         for kind, channel, message, said in messages.iter_decoded_messages():
-            assert kind is not None
             for again in _said_again(kind.name.split("/")[-1], said, packed):
                 if channel.topic not in channels:
                     name = again.DESCRIPTOR.full_name

@@ -7,13 +7,7 @@ import numpy as np
 from chsel.problem.poses import compose, inverse
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.rig import BoxRig, BubbleRig, CameraRig, ContactRig, HandRig, Rig
-from runners.simulated_robot.log_writer import (
-    LogWriter,
-    camera_info,
-    image,
-    joint_state,
-    transform,
-)
+from runners.simulated_robot.log_writer import LogWriter, camera_info, image, joint_state, transform
 from tests.runners.sensors.small_logs import BEGIN, SECOND, ros2_cloud
 
 LATENCY = 4_000_000  # ns from a stamp to its log time

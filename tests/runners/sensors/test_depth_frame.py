@@ -14,10 +14,7 @@ from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
 from chsel.sensing.depth_camera import one_per_voxel
 from runners.command.choices import CONF
-from runners.sensors.depth_frame import (
-    depth_frame_points,
-    read_depth_frame,
-)
+from runners.sensors.depth_frame import depth_frame_points, read_depth_frame
 from runners.sensors.rig import GateRig, Rig
 
 WIDTH, HEIGHT = 80, 60
@@ -66,7 +63,6 @@ def test_a_frame_is_read_with_all_its_parts(tmp_path):
     assert frame.depth[30, 45] == pytest.approx(FRONT)
     assert frame.depth[0, 0] == 0.0
     assert (frame.camera.width, frame.camera.height, frame.camera.fy) == (WIDTH, HEIGHT, 110.0)
-    assert frame.label is not None
     assert int(frame.label.sum()) == 20 * 30
     np.testing.assert_allclose(frame.world_from_camera, POSE)
     np.testing.assert_allclose(frame.world_from_object, POSE)
@@ -127,7 +123,6 @@ def test_surface_points_are_the_boxes_front_without_its_outline(tmp_path):
     np.testing.assert_allclose(in_camera[:, 2], FRONT, atol=1e-12)
     assert in_camera[:, 0].min() == pytest.approx((33 - 39.5) / 100 * FRONT)
     assert in_camera[:, 1].max() == pytest.approx((36 - 29.5) / 110 * FRONT)
-    assert found.labelled is not None
     assert found.labelled.edges == 600 - 14 * 24  # inside of the outline
     assert found.counts.edges == found.labelled.edges + 26 * 36 - 600  # and outside
     assert found.counts.invalid == HEIGHT * 5
@@ -157,7 +152,6 @@ def test_pixels_of_a_label_that_are_not_connected_are_left_out(tmp_path, blob, d
     frame.depth[blob] = depth
     found = points_of(frame, rig(edge_reach=1))
     labelled = found.labelled
-    assert labelled is not None
     assert bool(found.surface[blob].any()) is kept
     assert {"small": labelled.small > 0, "far": labelled.far > 0, "none": kept}[reason]
     assert (labelled.small > 0) + (labelled.far > 0) == (not kept)
@@ -246,7 +240,6 @@ def test_the_real_frame_registers_near_its_published_pose(real_directory):
 
 def test_the_real_frame_of_a_brick_has_no_point_off_it_and_no_free_voxel_in_it(real_directory):
     frame, found, mesh, distance = real_frame(real_directory, "frame_foam_brick.yaml")
-    assert found.labelled is not None
     assert found.labelled.small == 50  # a patch 26 mm behind the brick, at its upper edge
     assert np.abs(distance).max() < 0.0035
     truth = inverse(frame.world_from_object)

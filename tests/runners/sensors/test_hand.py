@@ -60,7 +60,6 @@ def test_boxes_stand_where_the_rig_puts_them():
     turned = (np.pi / 2, 0.0, np.pi / 2)
     boxes = BoxRig((0.1, 0.2, 0.3), (1.0, 0.0, 0.0)), BoxRig((0.1, 0.2, 0.3), rotation=turned)
     solids = HandModel(HandRig(frame="hand", boxes=boxes)).solids()
-    assert solids is not None
     assert solids.is_watertight
     assert solids.volume == pytest.approx(2 * 0.006)
     upright, lying = solids.split()

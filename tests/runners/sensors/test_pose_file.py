@@ -1,5 +1,3 @@
-"""Files that say where an object is."""
-
 import numpy as np
 import pytest
 import yaml

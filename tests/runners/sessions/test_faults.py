@@ -11,14 +11,7 @@ from chsel.errors import SettingError
 from chsel.problem.points import FreeVoxels, Lattice, Workspace
 from chsel.problem.settings import settings_mapping
 from runners.objects.loader import load_model
-from runners.sessions.faults import (
-    CLEAN,
-    LEVELS,
-    Faults,
-    FaultSettings,
-    level_name,
-    probed_mesh,
-)
+from runners.sessions.faults import CLEAN, LEVELS, Faults, FaultSettings, level_name, probed_mesh
 from runners.sessions.probing import open_probing
 from runners.sessions.probing_settings import ProbingSettings, without_defaults
 

@@ -112,6 +112,21 @@ def test_malformed_arrays_are_named(tmp_path, arrays, message):
         read_points(npz(tmp_path, **arrays))
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("x,y,z\n0,0,0\n", "its columns are x, y, z; accepted: x, y, z, kind"),
+        ("x,y,z,kind\n0,0,0,solid\n", "row 1: kind is none of surface, free"),
+        ("x,y,z,kind\n0,b,0,free\n", "could not convert .*'b'; accepted: numbers"),
+        ("x,y,z,kind,sdf\n0,0,0,known,\n", "row 1: a known point needs an sdf"),
+        ("x,y,z,kind,step\n0,0,0,free,1.5\n", "row 1: step is not an integer"),
+    ],
+)
+def test_malformed_rows_are_named(tmp_path, content, message):
+    with pytest.raises(PointsError, match=rf"points.csv.*{message}"):
+        read_points(text(tmp_path, content))
+
+
 def test_files_that_are_not_what_their_suffix_says_are_refused(tmp_path):
     for suffix in ("npz", "ply", "off", "stl", "csv", "xyz"):
         path = tmp_path / f"noise.{suffix}"

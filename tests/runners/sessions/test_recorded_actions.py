@@ -1,5 +1,3 @@
-"""Recorded grids, taken in any order."""
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -276,6 +276,15 @@ def test_a_log_that_lacks_something_says_so(tmp_path, written, changes, message)
         open_log(log, replace(RIG, **changes))
 
 
+def test_a_hole_in_the_transforms_costs_the_images_within(tmp_path):
+    session = open_log(SphereLog(lost_transforms=(3.4, 4.6)).write(tmp_path / "log.mcap"))
+    events = list(session.probes())
+    first, second = probes(events)
+    assert (len(first.contacts), second.outcome) == (50, "free")
+    assert [session.report.by_probe[step]["pad"].lost for step in (0, 1)] == [0, 12]
+    assert "pad: left out, as the pose of pad_frame is not known then (12 times)" in lines(events)
+
+
 def test_a_camera_whose_clock_is_ahead_is_put_right(tmp_path, events):
     log = SphereLog(camera_clock=100.0).write(tmp_path / "log.mcap")
     ahead = list(open_log(log).probes())

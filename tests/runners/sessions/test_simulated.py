@@ -55,7 +55,6 @@ def pair(request):
     mesh = _mesh(request.param)
     simulated = open_probing("simulated", mesh, request.param, ProbingSettings(), 0)
     kinematic = open_probing("kinematic", mesh, request.param, ProbingSettings(), 0)
-    assert simulated.world_from_object is not None
     both = list(simulated.probes()), list(kinematic.probes())
     simulated.close()
     return _Pair(mesh, simulated.world_from_object, *both)

@@ -34,7 +34,6 @@ def test_a_probe_goes_straight_along_the_hand_and_meets_what_is_forecast(session
     mesh, actions = _mustard(), session.offer(ActionSettings())
     chosen = np.linspace(0, len(actions) - 1, 9).astype(int).tolist()
     taken = [(action, next(session.take(step, action))) for step, action in enumerate(chosen)]
-    assert session.world_from_object is not None
     object_from_world = inverse(session.world_from_object)
     belief = Belief(object_from_world[None], np.ones(1))
     sdf = SdfGrid.from_mesh(mesh, 0.005, padding=0.02)
@@ -97,7 +96,6 @@ def test_the_grid_as_actions_has_the_outcomes_of_the_grid():
 
 
 def test_a_hand_that_would_start_in_the_object_comes_from_behind(session):
-    assert session.world_from_object is not None
     centre = apply(session.world_from_object, _mustard().center_mass[None])[0]
     actions = session.offer(ActionSettings())
     poses = np.array(actions.world_from_hand[:1])

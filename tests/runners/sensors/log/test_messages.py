@@ -1,5 +1,3 @@
-"""Messages and images of logs."""
-
 import struct
 from collections import Counter
 
@@ -21,15 +19,7 @@ from runners.sensors.log.messages import (
 from runners.sensors.log.raw_log import RawLog
 from runners.simulated_robot.log_writer import image
 from tests.runners.sensors.foxglove_log import in_foxgloves_messages
-from tests.runners.sensors.small_logs import (
-    BEGIN,
-    SECOND,
-    depth,
-    png,
-    ros2_sent,
-    write_ros2,
-    xyz,
-)
+from tests.runners.sensors.small_logs import BEGIN, SECOND, depth, png, ros2_sent, write_ros2, xyz
 
 TURNED = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])
 
