@@ -1,5 +1,6 @@
 # make probe: set up and run a session. make test: set up and run the checks of every commit.
 # make test-all: those that take long and rarely fail, too.
+# make docs: the documentation as a site with search, build/site/index.html.
 # make mutants ROOM=chsel/next_probe: how many single mistakes in a room its tests notice.
 # make PYTHON=python3.12 probe: with another Python, 3.11 or newer.
 # make PIP_ARGS="--extra-index-url URL" probe: with options for pip install.
@@ -12,7 +13,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL = $(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint $(VENV)/constraints.txt
 
-.PHONY: probe test test-all mutants clean
+.PHONY: probe test test-all docs mutants clean
 
 probe: $(VENV)/.installed
 	@if $(BIN)/python -c "import pybullet" 2>/dev/null; then session=simulated; else \
@@ -29,6 +30,12 @@ test: $(VENV)/.installed-test
 
 test-all: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "slow or not slow"
+
+docs: $(VENV)/constraints.txt
+	$(INSTALL) --editable ".[docs]"
+	rm -rf build/pages && mkdir -p build/pages
+	cp -r --parents *.md CITATION.cff LICENSE docs examples replay/*.png replay/*.webp build/pages
+	$(BIN)/python -m zensical build --strict --clean
 
 mutants: $(VENV)/.installed-test
 	$(INSTALL) --editable ".[mutants]"

@@ -1,0 +1,1 @@
+"""The method anchored, described in docs/anchored.md."""

@@ -1,0 +1,1 @@
+"""A decision on where to touch next: actions, belief, first contacts, forecasts."""

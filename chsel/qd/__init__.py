@@ -1,0 +1,1 @@
+"""Quality diversity: archive, measures, emitters, selection (CHSEL, Sec. IV-C)."""

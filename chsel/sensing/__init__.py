@@ -1,0 +1,1 @@
+"""Points from depth images, contacts and motions."""
