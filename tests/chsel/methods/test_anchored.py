@@ -8,8 +8,9 @@ import trimesh
 
 from chsel.errors import ChselError
 from chsel.methods import build_method, trust_by
-from chsel.methods.anchor_sampling import AnchorSampler
+from chsel.methods.anchor_sampling import AnchorSampler, most_informative_first
 from chsel.methods.anchored.anchored import Anchored, AnchoredSettings, Effort, Search, distinct
+from chsel.methods.anchored.energy import Energy
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.noise import LATER, WRONG, noise_model
@@ -86,6 +87,37 @@ def test_results_depend_on_the_seed():
 def test_odd_points_have_results(name):
     method = anchored()
     registered(method, posed(method, ODD[name]))
+
+
+def test_poses_are_rated_by_64_contacts_that_are_far_apart():
+    method = anchored()
+    points = most_informative_first(ODD["hundreds"])
+    few = replace(points, known=points.known[:64], known_sdf=points.sdf[:64])
+    poses = Poses.of(posed(method).initial_set[:4])
+    found = Search(posed(method, points), method.settings, NullObserver()).energy.of(poses)
+    expected = Energy(posed(method, few), few, noise_model(method.settings.noise)).of(poses)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_an_observer_is_shown_poses_of_three_stages_and_one_archive():
+    watcher, method = Watcher(), anchored()
+    found = method.register(posed(method), watcher)
+    stages = [(trace.stage, trace.iteration) for trace in watcher.traces]
+    assert stages == [("fit", 0), ("descend", 0), ("spread", 0)]
+    search = Search(posed(method), method.settings, NullObserver())
+    for trace in watcher.traces:
+        energies = search.energy.of(search_space(None, GRID).poses(trace.vectors))
+        np.testing.assert_allclose(trace.cost, energies, rtol=1e-9, atol=1e-9)
+    assert watcher.progressed == [
+        ("sample", 4000, 4000),
+        ("fit", 1, 1),
+        ("search", 0, 0),
+        ("descend", 1, 1),
+        ("spread", 1, 1),
+    ]
+    assert found.archive is not None
+    assert [archive.digest for archive in watcher.archives] == [found.archive.digest]
+    assert (found.archive.iteration, found.archive.refinement) == (0, 0)
 
 
 def test_few_contacts_leave_many_distinct_poses():

@@ -2,14 +2,20 @@
 
 import numpy as np
 import pytest
+import trimesh
 
+from chsel.methods.anchored.energy import Energy
 from chsel.problem.noise import INDEPENDENT, WRONG, noise_model
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, compose, inverse, random_rotations
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
 from tests.chsel.methods.scene import (
     BOX,
     BOX_GRID,
     TRUTH,
+    WORKSPACE,
     contacts_on,
     energy_of,
     poses_around_truth,
@@ -50,15 +56,29 @@ def near_and_far():
         (points_with(60), 0.004),
         (KnownPoints(free=FREE, known=contacts_on(BOX, 20)), 0.0),
         (KnownPoints(free=FREE), 0.004),
-        (KnownPoints(free=[*FREE, [1e8, 0.0, 0.0]]), 0.0),
+        (KnownPoints(free=np.concatenate([FREE, [[1e9, 0.0, 0.0]]])), 0.0),
         (KnownPoints(occupied=OCCUPIED), 0.0),
     ],
-    ids=["few contacts", "many contacts", "exact contacts", "free", "far free", "occupied"],
+    ids=["few contacts", "many contacts", "exact contacts", "free", "free, and far", "occupied"],
 )
 def test_energy_is_the_plain_formula(points, shared):
+    """Also of poses that stretch the object."""
     noise, poses = noise_model(SENSOR, shared), near_and_far()
+    poses = Poses.joined([poses, Poses(1.5 * poses.numbers)])
     expected = plain_energies(noise, BOX_GRID, points, poses)
     assert np.ptp(expected) > 1.5 * WRONG
     counted = min(len(points.known), INDEPENDENT)
     found = energy_of(points, noise).of(poses)
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9 + TABLE_ERROR * counted)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_free_points_count_up_to_the_ends_of_a_long_object(axis):
+    sdf = SdfGrid.from_mesh(trimesh.creation.box(np.roll([0.5, 0.06, 0.05], axis)), 0.01)
+    places = np.roll([[x, 0.028, 0.0] for x in np.linspace(-0.24, 0.24, 25)], axis, axis=1)
+    poses = Poses.of(compose(np.tile(np.eye(3), (25, 1, 1)), places))
+    points, noise = KnownPoints(free=np.zeros((1, 3))), noise_model(SENSOR)
+    problem = RegistrationProblem(sdf, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(0, 0))
+    found = Energy(problem, points, noise).of(poses)
+    np.testing.assert_allclose(found, plain_energies(noise, sdf, points, poses), atol=1e-9)
+    assert found.min() > 0.05

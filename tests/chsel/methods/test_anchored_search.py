@@ -57,8 +57,10 @@ def test_a_new_mode_is_farther_than_the_old_ones_are_from_each_other():
     near, far = [turned(0.0, 0.001 * n) for n in range(5)], [turned(0.0, 0.1)]
     assert not has_new_mode(BOX_GRID, poses_of(*near[:2]), poses_of(*near[2:]), 30)
     assert has_new_mode(BOX_GRID, poses_of(*near), poses_of(near[0], *far), 30)
-    spread = poses_of(*(turned(0.0, 8.0 * FAR * n) for n in range(4)))
-    between = poses_of(turned(0.0, 12.0 * FAR))
+    spread = poses_of(*(turned(0.0, FAR * n) for n in (0, 14, 20, 30)))
+    beside, between = poses_of(turned(0.0, FAR * 38)), poses_of(turned(0.0, FAR * 25))
+    assert has_new_mode(BOX_GRID, spread, beside, 4)
+    assert not has_new_mode(BOX_GRID, spread, beside, 3)  # 14 cm from each other
     assert not has_new_mode(BOX_GRID, spread, between, 4)
     none = Poses(np.zeros((0, 12)))
     assert has_new_mode(BOX_GRID, none, spread, 30)
@@ -159,16 +161,21 @@ CENTRE = object_centre(BOX_GRID)
 TWISTS = twists_of(SE3Space(), CENTRE)
 X, Y, Z = 0.5 * BOX_SIDES
 FOREIGN = apply(TRUTH, np.array([[0.0, 0.0, Z + 0.03]]))
+HEIGHTS = np.linspace(-0.002, 0.006, 24)
 FREE = np.array([[X - 0.004, 0.02, 0.01], [X - 0.003, -0.02, 0.01], [X - 0.006, 0.0, -0.01]])
 OCCUPIED = np.array([[0.02, 0.01, -Z - 0.003], [-0.02, 0.01, -Z - 0.004]])
 AT_ODDS = KnownPoints(
     free=apply(TRUTH, np.concatenate([FREE, [[0.03, Y - 0.004, 0.01], [0.04, Y - 0.015, -0.01]]])),
     occupied=apply(TRUTH, OCCUPIED),
     known=np.concatenate(
-        [apply(TRUTH, on_faces(24, 0.001 * np.random.default_rng(1).standard_normal(24))), FOREIGN]
+        [
+            apply(TRUTH, on_faces(24, HEIGHTS + 0.001 * np.random.default_rng(1).normal(size=24))),
+            FOREIGN,
+        ]
     ),
+    known_sdf=[*HEIGHTS, 0.0],
 )
-"""Contacts off by 1 mm, one on another object, and free and occupied voxels that are wrong."""
+"""Known points off by 1 mm, one on another object, and free and occupied voxels that are wrong."""
 
 
 def off_truth(poses):
@@ -196,7 +203,7 @@ def test_a_fit_ends_where_no_motion_lowers_the_plain_formula():
     assert least.nfev > 60
     assert after[0] - least.fun < 0.01
     known = BOX_GRID.at(apply(found.matrices[0], AT_ODDS.known), lookup="trilinear")[0]
-    assert np.abs(known[:24]).max() < 0.006
+    assert np.abs(known[:24] - HEIGHTS).max() < 0.006
     assert abs(known[24] - 0.03) < 0.002  # the foreign contact moves nothing
 
 
@@ -225,3 +232,47 @@ def test_on_a_plane_fits_stay_on_it():
     assert (energy.of(found) < energy.of(poses)).all()
     again = space.poses(space.encode(found))
     np.testing.assert_allclose(again.numbers, found.numbers, atol=1e-9)
+
+
+def test_a_step_of_a_fit_is_at_most_80_mm_and_half_a_radian():
+    """About the centre; by Cayley, a turn of twice the arctangent of a quarter."""
+    rough = NoiseModel((0.3,) * LEVELS, (1.0 / LEVELS,) * LEVELS)
+    energy = energy_of(KnownPoints(known=apply(TRUTH, on_faces(24))), rough)
+    far = poses_of(turned(0.0, 0.25), turned(1.4))
+    steps = fitted(energy, TWISTS, far, 1).matrices @ inverse(far.matrices)
+    shift = apply(steps[0], CENTRE[None])[0] - CENTRE
+    assert np.sqrt((shift**2).sum()) == pytest.approx(0.08)
+    assert rotation_angle(steps[1:, :3, :3])[0] == pytest.approx(2.0 * math.atan(0.25))
+
+
+def test_moves_turn_about_a_contact_or_the_centre_and_shift():
+    """By normal sizes times 10^U(-0.9, 0.3); 6 rad go with a metre, 3 of 5 turn about a contact."""
+    contacts = np.array([[0.1, 0.0, 0.0], [-0.1, 0.05, 0.0], [0.0, 0.0, 0.3]])
+    flat = NoiseModel((1e3,) * LEVELS, (1.0 / LEVELS,) * LEVELS)
+    energy, count = energy_of(KnownPoints(known=apply(TRUTH, contacts)), flat), 40_000
+    space, middle = SE3Space(), TRUTH[:3, 3]
+    stride = stride_of(space, CENTRE, (middle - 9.0, middle + 9.0))
+    starts, stream = repeated(TRUTH, count), StreamKey(5, 2).kernel_stream(Purpose.WALKS, 3)
+    chains = walked(energy, stride, starts, energy.of(starts), np.inf, 1, stream, 1)
+    moves = Poses(chains.poses).matrices @ TRUTH
+    turns = moves[:, :3, :3]
+    skew = (turns - np.swapaxes(turns, 1, 2)) / (1.0 + np.trace(turns, axis1=1, axis2=2))[
+        :, None, None
+    ]
+    vectors = 2.0 * skew[:, [2, 0, 1], [1, 2, 0]]  # of Cayley
+    variance = 0.01**2 * (10**0.6 - 10**-1.8) / (2.4 * math.log(10.0))
+    np.testing.assert_allclose(
+        vectors.mean(axis=0), 0.0, atol=4.0 * 6.0 * (variance / count) ** 0.5
+    )
+    covariance = vectors.T @ vectors / count
+    np.testing.assert_allclose(covariance / (36.0 * variance), np.eye(3), atol=0.04)
+    angles = rotation_angle(turns)
+    axes = vectors / np.sqrt((vectors**2).sum(axis=1, keepdims=True))
+    pivots = np.concatenate([contacts, CENTRE[None]])
+    chances = np.array([0.2, 0.2, 0.2, 0.4])
+    for point in pivots:
+        levers = point - pivots
+        across = (levers**2).sum(axis=1) - (axes @ levers.T) ** 2
+        expected = 3.0 * variance + ((4.0 * np.sin(0.5 * angles) ** 2) * (across @ chances)).mean()
+        moved = ((apply(moves, point[None])[:, 0] - point) ** 2).sum(axis=1).mean()
+        assert moved == pytest.approx(expected, rel=0.04)

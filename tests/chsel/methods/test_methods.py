@@ -8,8 +8,7 @@ import pytest
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.torch_cost import RelaxedCost
 from chsel.errors import ChselError
-from chsel.methods import METHODS, build_method, chsel, preset_settings
-from chsel.methods.gradient_descent import descend
+from chsel.methods import METHODS, build_method, preset_settings
 from chsel.methods.medial_constraint import MedialCost, MedialCostSettings
 from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors
@@ -17,7 +16,7 @@ from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, check_rigid, inverse
 from chsel.problem.settings import PRESETS, settings_mapping
-from chsel.problem.streams import Purpose, StreamKey, normals
+from chsel.problem.streams import StreamKey
 from tests.chsel.methods.scene import (
     ODD,
     STANDING,
@@ -178,21 +177,3 @@ def test_more_passes_do_not_worsen_the_best_cost():
     costs = [quick("chsel", passes=passes).register(problem).cost[0] for passes in (1, 2, 3)]
     assert costs[1] <= costs[0] + 1e-12
     assert costs[2] <= costs[1] + 1e-12
-
-
-def test_a_further_pass_starts_from_the_best_fifth_and_around_its_mean(monkeypatch):
-    starts = []
-
-    def noted(objective, poses, *rest):
-        starts.append(poses)
-        return descend(objective, poses, *rest)
-
-    monkeypatch.setattr(chsel, "descend", noted)
-    problem = posed(quick("chsel", "paper"), FEW)
-    best = Poses.of(quick("chsel", "paper").register(problem).object_from_world[:6])  # of 30
-    quick("chsel", "paper", passes=2).register(problem)
-    np.testing.assert_allclose(starts[-1].numbers[:6], best.numbers, atol=1e-12)
-    where = best.translations
-    drawn = normals(problem.key.stream(Purpose.REFINEMENT, 1), (30, 9))[6:, 6:]
-    expected = where.mean(axis=0) + np.std(where, axis=0, ddof=1) * drawn
-    np.testing.assert_allclose(starts[-1].translations[6:], expected, atol=1e-12)
