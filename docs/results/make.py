@@ -1,0 +1,275 @@
+"""`python -m docs.results.make`: docs/results.md, docs/benchmark.md and the README's numbers.
+
+python -m docs.results.make                  write the pages from the tables in this folder
+python -m docs.results.make store FOLDER ...  put evaluations here first, under their names
+python -m docs.results.make rank FOLDER      put an evaluation of one's own beside that here
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import pandas as pd
+import pyarrow.parquet
+
+from replay.console import Console
+from runners.evaluation.experiment import TABLES
+from runners.reporting import sections, statistics
+from runners.reporting.evaluation_folder import TRIAL, Evaluation, open_evaluation
+from runners.reporting.figures import styles_of
+from runners.reporting.tables import (
+    Table,
+    number,
+    percent,
+    percent_range,
+    print_table,
+    with_range,
+)
+from runners.sessions.faults import LEVELS
+
+HERE, DOCS = Path(__file__).parent, Path(__file__).parents[1]
+PAGES = {HERE / f"{name}.md.j2": DOCS / f"{name}.md" for name in ("results", "benchmark")}
+README = DOCS.parent / "README.md"
+_BLOCK = re.compile(r"(<!-- ([a-z_]+) of docs/results -->\n).*?(<!-- end -->)", re.DOTALL)
+_KEYS = [*TRIAL, "faults", "step", "method", "policy", "draw"]
+_TIMES = ["seconds", "decision_seconds"]
+PACKAGE = "package"  # with which methods are compared
+
+
+@cache
+def evaluation(name: str) -> Evaluation:
+    """The one that is kept under this name."""
+    return open_evaluation(HERE / name)
+
+
+def stored() -> list[str]:
+    """Names of all evaluations here."""
+    return sorted(path.parent.name for path in HERE.glob("*/experiment.json"))
+
+
+def table(name: str, title: str, baseline: str | None = None, without: str = "") -> str:
+    """A table of the report of an evaluation, by its title; without: columns, by commas."""
+    found = [
+        table
+        for section in sections.sections_of(evaluation(name), baseline)
+        for table in section.tables
+        if table.title == title
+    ]
+    (one,) = found
+    out = [n for n, head in enumerate(one.header) if head not in without.split(", ")]
+    rows = [[row[n] for n in out] for row in [one.header, *one.rows]]
+    rows.insert(1, [":--"] * one.labels + ["--:"] * (len(out) - one.labels))
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+
+
+@cache
+def _with_ratios(name: str, to: str) -> pd.DataFrame:
+    return statistics.with_ratios(evaluation(name).rows, to)
+
+
+def _chosen(rows: pd.DataFrame, where: Mapping[str, Any]) -> pd.DataFrame:
+    """The rows that have these values in these columns."""
+    for column, value in where.items():
+        rows = rows[rows[column] == value]
+    return rows
+
+
+def ratio(name: str, method: str, to: str, **where: Any) -> str:
+    """PD by that of another method at the same steps; what may be 1 is said to be within noise."""
+    own = _chosen(_with_ratios(name, to), {"method": method, **where})
+    mean, lower, upper = statistics.ratio_interval(own)
+    return with_range(mean, lower, upper) + (", within noise" if lower <= 1.0 <= upper else "")
+
+
+def better(name: str, method: str, than: str, **where: Any) -> str:
+    """The share of steps at which a method has a lower PD than another one."""
+    own = _chosen(_with_ratios(name, than), {"method": method, **where})["ratio"].dropna()
+    return percent((own < 1.0 - 1e-9).mean())
+
+
+def numbers(name: str, column: str, **where: Any) -> pd.Series:
+    """The numbers of a column that there are, of rows with these values."""
+    return _chosen(evaluation(name).rows, where)[column].dropna().astype(float)
+
+
+def median(name: str, column: str, **where: Any) -> str:
+    """Of these numbers."""
+    return number(numbers(name, column, **where).median())
+
+
+def share(name: str, column: str, below: float | None = None, **where: Any) -> str:
+    """Of rows with a flag, or with a number below a limit; Wilson's interval."""
+    values = numbers(name, column, **where)
+    flags = values > 0.5 if below is None else values < below
+    frame = pd.DataFrame({"all": 0, "flag": flags})
+    return percent_range(statistics.shares(frame, "all", "flag").iloc[0])
+
+
+def mean_share(name: str, column: str, **where: Any) -> str:
+    """The mean of numbers from 0 to 1, as a share."""
+    return percent(numbers(name, column, **where).mean())
+
+
+def count(name: str, **where: Any) -> int:
+    """How many registrations, or probes of policies, an evaluation has."""
+    if evaluation(name).experiment["policies"]:
+        return len(evaluation(name).probes)
+    return len(numbers(name, "step", **where))
+
+
+def title(name: str, method: str) -> str:
+    """What tables call a method."""
+    return styles_of(evaluation(name).methods)[method].title
+
+
+def commit(name: str) -> str:
+    """Of the code that made the registrations."""
+    made = {one.get("checkout", "?") for one in evaluation(name).experiment["environments"]}
+    return ", ".join(f"`{one[:9]}`" for one in sorted(made))
+
+
+def digest(name: str) -> str:
+    """Of the table of an evaluation."""
+    files = sorted((HERE / name).glob("*.parquet"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
+
+
+def commands(*names: str) -> str:
+    """The commands that made evaluations, to be copied."""
+    lines = [line for name in names for line in evaluation(name).experiment["commands"]]
+    return "```sh\n" + "\n".join(dict.fromkeys(lines)) + "\n```"
+
+
+def definition(name: str) -> str:
+    """The plausible sets behind an evaluation's PD, if it has any."""
+    every = evaluation(name)
+    return "" if every.experiment["policies"] else every.definition_text
+
+
+def levels(name: str) -> list[str]:
+    """Faults of an evaluation, in the order of their table."""
+    there = set(evaluation(name).rows["faults"])
+    return [level for level in LEVELS if level in there]
+
+
+def moment(method: str, iteration: int, column: str = "diversity") -> str:
+    """Median of the searches of `paper_qd` after so many iterations."""
+    rows = evaluation("paper_qd").iterations
+    own = rows[(rows["method"] == method) & (rows["iteration"] == iteration)]
+    return number(own[column].median())
+
+
+def solved(name: str, policy: str) -> str:
+    """The share of a policy's sessions whose set comes within 10 mm."""
+    errors = statistics.steered_sessions(evaluation(name)).errors.loc[policy]
+    return percent((errors.min(axis=1) < statistics.GOOD).mean())
+
+
+def _speeds() -> dict[tuple[str, str], str]:
+    """Milliseconds by problem and registration, of docs/speed.md."""
+    lines = (DOCS / "speed.md").read_text().splitlines()
+    cells = [[cell.strip() for cell in line.strip("| ").split("|")] for line in lines]
+    return {(row[0], row[1]): row[2] for row in cells if len(row) == 7}
+
+
+def speed_of(problem: str, registration: str) -> str:
+    """Milliseconds of a registration in the median."""
+    return _speeds()[problem, registration]
+
+
+def speeds(problems: Mapping[str, str], columns: Mapping[str, str]) -> str:
+    """Milliseconds by problem and registration, each with its name in the table."""
+    every = _speeds()
+    lines = [["drill", *columns.values()], ["---", *["--:"] * len(columns)]]
+    for name, text in problems.items():
+        lines.append([text, *(every.get((name, column), "") for column in columns)])
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def store(folder: Path) -> None:
+    """Put the tables of an evaluation here, smaller, and without those of single machines."""
+    experiment = json.loads((folder / "experiment.json").read_text())
+    to = HERE / experiment["name"]
+    to.mkdir(exist_ok=True)
+    (to / "experiment.json").write_text(json.dumps(experiment, indent=1) + "\n")
+    for name in TABLES:
+        if (folder / f"{name}.parquet").exists():
+            table = pyarrow.parquet.read_table(folder / f"{name}.parquet")
+            pyarrow.parquet.write_table(table, to / f"{name}.parquet", compression="zstd")
+
+
+def rank(folder: Path) -> Iterator[str | Table]:
+    """Whether an evaluation has the bits of the one here where both have rows, and its place."""
+    own = open_evaluation(folder)
+    ours = evaluation(own.experiment["name"])
+    kind, group = ("probes", "policies") if own.experiment["policies"] else ("rows", "methods")
+    tables = [getattr(one, kind) for one in (own, ours)]
+    keys = [key for key in _KEYS if key in tables[0]]
+    mine, theirs = (one.set_index(keys).drop(columns=_TIMES, errors="ignore") for one in tables)
+    common = mine.index.intersection(theirs.index)
+    first, second = mine.loc[common], theirs.loc[common]
+    equal = ((first == second) | (first.isna() & second.isna())).fillna(False).all(axis=1)
+    yield f"{equal.sum()} of {len(common)} rows that both have are the same to the bit"
+    yield from (f"differs: {dict(zip(keys, key, strict=True))}" for key in common[~equal][:1])
+    named = {group: {**own.experiment[group], **ours.experiment[group]}}
+    rows = {kind: pd.concat([tables[0][~mine.index.isin(common)], tables[1]])}
+    both = replace(ours, experiment={**ours.experiment, **named}, **rows)
+    if kind == "probes":
+        yield from sections.short_tables(both)
+    else:
+        yield sections.against_baseline(both, PACKAGE)[0]
+
+
+def ranked(name: str, to: str) -> list[str]:
+    """Methods by their ratio of PD to another one's, best first."""
+    means = _with_ratios(name, to).groupby("method")["ratio"].agg(statistics.geometric_mean)
+    return list(means.dropna().sort_values().index)
+
+
+def write(checked: bool = False) -> list[Path]:
+    """The pages that are not what the tables say; checked: these are not written anew."""
+    loader = jinja2.FileSystemLoader(HERE)
+    engine = jinja2.Environment(
+        loader=loader, undefined=jinja2.StrictUndefined, keep_trailing_newline=True
+    )
+    engine.globals |= {name: value for name, value in globals().items() if callable(value)}
+    texts = {page: engine.get_template(path.name).render() for path, page in PAGES.items()}
+    blocks = engine.get_template("README.md.j2").module
+
+    def filled(match: re.Match[str]) -> str:
+        return f"{match[1]}{getattr(blocks, match[2])()}\n{match[3]}"
+
+    texts[README] = _BLOCK.sub(filled, README.read_text())
+    stale = [page for page, text in texts.items() if not page.exists() or page.read_text() != text]
+    for page in stale if not checked else ():
+        page.write_text(texts[page])
+    return stale
+
+
+def main(arguments: list[str]) -> None:
+    """See above."""
+    verb, folders = (arguments or ["write"])[0], [Path(name) for name in arguments[1:]]
+    if verb not in ("write", "store", "rank") or bool(folders) != (verb != "write"):
+        sys.exit(f"{' '.join(arguments)} is none of:\n{__doc__}")
+    if verb == "rank":
+        console = Console()
+        for shown in rank(folders[0]):
+            print_table(console, shown) if isinstance(shown, Table) else console.print(shown)
+        return
+    for folder in folders:
+        store(folder)
+    for page in write():
+        print(page)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
