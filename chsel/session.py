@@ -22,6 +22,7 @@ from chsel.belief import Gripper, PoseBelief
 from chsel.errors import (
     InputWarning,
     PointsError,
+    PointsWarning,
     PoseError,
     SettingError,
     quoted,
@@ -41,6 +42,7 @@ from chsel.events import (
     SessionStarted,
 )
 from chsel.methods import METHODS, build_method, default_method, noise_of
+from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
 from chsel.methods.method import Method
 from chsel.next_probe.action_lattice import ActionSettings, around_actions
 from chsel.next_probe.decision_problem import Actions, Decision, HandShape
@@ -75,6 +77,7 @@ if TYPE_CHECKING:
 
 FROM_SESSION = "session"
 """The code of warnings that come with the points."""
+_CLOSE = 2.0  # noise levels: a misfit that needs no explanation
 _MOST_SHOWN = 200  # poses of a path, in recordings
 _ACROSS = 15.0  # to a diameter: points on the object that a depth image gives
 _UNIT = 1e-4  # m: of recorded depths, up to 6.5 m; of others a multiple of it
@@ -560,6 +563,28 @@ class Session:
             if self.registered is not None and not self._closed:
                 self._recorder.record(self._belief.event(self.step))
         return self._belief
+
+    def check_moved(self, most: float = 0.02) -> float:
+        """By how much each touch seems to have moved the object, metres, at most `most`; or 0.
+
+        Where the last result leaves contacts off its best pose, points are registered once more as
+        if touches had moved them. A distance that explains them better is a warning.
+        """
+        problem, pushes = self.problem, self.online.pushes(most)
+        if problem is None or problem.pushes is not None or pushes is None:
+            return 0.0
+        if self.trust is None or self.trust.misfit <= _CLOSE:
+            return 0.0
+        moving = Anchored(AnchoredSettings(noise=noise_of(self.method)))
+        distance = moving.register(replace(problem, pushes=pushes)).push_distance
+        if distance > 0.0:
+            text = (
+                f"the points fit better if each touch has moved the object by {distance:.3f} m; "
+                "state the most that it may: moves= of a Session, session.expect_moves= of a run"
+            )
+            self._warn([PointsWarning("moved", text)])
+            self.flush()
+        return distance
 
     def end_points(self) -> None:
         """Warn about points as they are at the end."""

@@ -149,6 +149,7 @@ def run(
                 display.probe(row)
                 display.warn(session.warnings)
                 interrupt.check()
+            session.check_moved()
             display.warn(session.warnings)
         except KeyboardInterrupt:
             outcome = "interrupted"

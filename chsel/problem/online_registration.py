@@ -233,12 +233,18 @@ class OnlineRegistration:
             elif settings.low_cost_set == "estimates":
                 low_cost_set = self.previous.object_from_world
         around, pushes = (self._workspace, self._free_resolution), None
-        if self._push_distance > 0.0 and self._pushes:
-            directions, before = zip(*self._pushes, strict=True)
-            pushes = Pushes(np.array(directions), np.array(before), self._push_distance)
+        if self._push_distance > 0.0:
+            pushes = self.pushes(self._push_distance)
         return RegistrationProblem(
             self.sdf, self.points, initial_set, *around, key, low_cost_set, pushes
         )
+
+    def pushes(self, largest: float) -> Pushes | None:
+        """The pushes so far, if each has moved the object by so many metres at most; None: none."""
+        if not self._pushes:
+            return None
+        directions, before = zip(*self._pushes, strict=True)
+        return Pushes(np.array(directions), np.array(before), largest)
 
     def start_afresh(self, larger: int = 1) -> None:
         """Let the next problem be a first one, with so many times the hypotheses."""

@@ -8,12 +8,13 @@ import pytest
 import chsel
 from chsel import KnownPoints, OnlineRegistration, Pushes, trust_in
 from chsel.errors import PointsError, SettingError
+from chsel.events import Probe
 from chsel.methods import trust_by
 from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses, inverse
 from chsel.problem.surface import outline_distances_to
-from tests.chsel.methods.scene import GRID, SIDE, STANDING, WORKSPACE, known_points
+from tests.chsel.methods.scene import GRID, MESH, SIDE, STANDING, WORKSPACE, known_points
 
 X, Y, DIAGONAL = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.6, 0.8, 0.0]
 SETTINGS = OnlineSettings(hypotheses=4, update="own")
@@ -79,6 +80,31 @@ def test_the_distance_of_pushes_is_found_and_the_pose_is_that_of_the_end():
     assert still.push_distance == 0.0
     assert distance_to(truth, still) > 0.005
     assert trust_in(problem, found).misfit < 0.5 * trust_in(standing, still).misfit
+
+
+@pytest.mark.parametrize("moves", [MOVES, 0.0])
+def test_a_session_that_was_not_told_notices_that_touches_move_the_object(moves):
+    contacts, random = known_points(STANDING, 12).known, np.random.default_rng(3)
+    if moves == 0.0:  # contacts that are off otherwise
+        contacts = contacts + random.normal(0.0, 0.003, contacts.shape)
+    settings = AnchoredSettings(size="small")
+    with chsel.Session(
+        MESH, resolution=0.01, workspace=WORKSPACE, method=Anchored(settings)
+    ) as session:
+        since = np.zeros(3)
+        for step, contact in enumerate(contacts):
+            angle = random.uniform(-np.pi, np.pi)
+            pose = np.eye(4)
+            pose[:3, 2] = np.cos(angle), np.sin(angle), 0.0  # the hand's way
+            new = KnownPoints(known=[contact + since])
+            session.observe(Probe(step, "contact", new, pose[None], new.known, np.zeros((1, 3))))
+            since += moves * pose[:3, 2]
+        session.register_step()
+        assert session.trust.misfit > 2.0
+        assert session.check_moved() == pytest.approx(moves, abs=0.001)
+        codes = {warning.code: warning.text for warning in session.warnings}
+        assert ("moved" in codes) is (moves > 0.0)
+        assert f"by {session.check_moved():.3f} m" in codes.get("moved", "by 0.000 m")
 
 
 def test_after_a_push_of_unknown_distance_no_pose_is_determined():
