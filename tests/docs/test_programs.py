@@ -1,7 +1,9 @@
 """Pages on programs of one's own: what stands there is what a user does, and it works."""
 
+import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +12,7 @@ import numpy as np
 import pyarrow.parquet as parquet
 import pytest
 
+import chsel
 from chsel import CompiledCost
 from chsel.events import Decided
 from chsel.next_probe.forecast import Forecast
@@ -156,3 +159,21 @@ def test_a_policy_decides_as_its_page_says_and_not_without_the_package(tmp_path)
     done = shell(f"python -m replay verify {path}", folder, PYTHONPATH="")
     assert done.returncode == 2, done.stdout
     assert "policy is 'entropy_first'; accepted: grid," in done.stderr
+
+
+def test_the_site_is_built_without_a_warning_and_has_every_public_name():
+    if shutil.which("make") is None:
+        pytest.skip("make is not installed")
+    pytest.importorskip("zensical", reason="the extra docs is not installed")
+    given = [f"BIN={Path(sys.executable).parent}", "INSTALL=true", "VENV=build"]
+    made = ["make", *given, "-o", "build/constraints.txt", "docs"]
+    done = subprocess.run(made, cwd=REPOSITORY, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "No issues found" in done.stdout + done.stderr
+    site = REPOSITORY / "build" / "site"
+    page = (site / "docs" / "api.html").read_text()
+    documented_together = {"__version__", "build_method", "build_policy"}
+    for name in set(chsel.__all__) - documented_together:
+        assert f'id="chsel.{name}"' in page, name
+    titles = [item["title"] for item in json.loads((site / "search.json").read_text())["items"]]
+    assert any("grasp_chance" in title for title in titles)

@@ -10,11 +10,30 @@ from replay.__main__ import main
 from replay.arguments import chosen_steps
 from replay.mcap.reader import read_recording
 from replay.verbs import VERBS
-from tests.tools.verb_arguments import verb_arguments
 
 REPLAY = Path(__file__).resolve().parents[1] / "replays" / "spam_can_icp.mcap"
 HOSTILE = "x[/x] [red]:smile: \x1b]0;title\x07\x1b[31m\x9b\u202e.mcap"
 SHOWN = "x[/x] [red]:smile: \\x1b]0;title\\x07\\x1b[31m\\x9b\\u202e.mcap"
+
+ARGUMENTS = {
+    "accept": ("FILE", "--yes"),
+    "compare": ("FILE", "--methods", "icp", "--steps", "STEP", "--save-csv", "OUT.csv"),
+    "diff": ("FILE", "OTHER"),
+    "export": ("FILE", "--what", "points", "-o", "OUT.npz"),
+    "info": ("FILE",),
+    "recover": ("FILE", "-o", "OUT.mcap"),
+    "step": ("FILE", "--step", "STEP", "-o", "OUT.mcap"),
+    "verify": ("FILE", "--step", "STEP"),
+    "view": ("FILE", "--save", "OUT.rrd"),
+}
+assert set(ARGUMENTS) == set(VERBS)
+
+
+def verb_arguments(verb, file, out, *, step=8, other=None):
+    """The verb and its arguments. out: name of what is written, without its suffix."""
+    names = {"FILE": str(file), "OTHER": str(other or file), "STEP": str(step)}
+    words = (names.get(word, word) for word in ARGUMENTS[verb])
+    return [verb, *(word.replace("OUT.", f"{out}.") for word in words)]
 
 
 EXISTING = (2, 3, 5, 8, 9)
