@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from chsel.methods.anchored.anchored import FAR, distinct, has_new_mode, near_symmetries
 from chsel.methods.anchored.fitting import fitted, twists_of
 from chsel.methods.anchored.walking import stride_of, walked
-from chsel.problem.noise import LEVELS, NoiseModel, noise_model
+from chsel.problem.noise import EXTENT, LEVELS, SHARE, NoiseModel, noise_model
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, rotation_angle
 from chsel.problem.sdf_grid import SdfGrid
@@ -243,6 +243,34 @@ def test_a_step_of_a_fit_is_at_most_80_mm_and_half_a_radian():
     shift = apply(steps[0], CENTRE[None])[0] - CENTRE
     assert np.sqrt((shift**2).sum()) == pytest.approx(0.08)
     assert rotation_angle(steps[1:, :3, :3])[0] == pytest.approx(2.0 * math.atan(0.25))
+
+
+def test_a_step_of_a_fit_is_that_of_levenberg_and_marquardt():
+    """By the normal equations in numpy, of turns by 1 rad and shifts by 0.15 m about a point."""
+    sigma, softness, pivot = 0.3, 0.2, np.array([0.03, -0.05, 0.02])
+    wide = NoiseModel((sigma,) * LEVELS, (1.0 / LEVELS,) * LEVELS, softness=softness)
+    poses = poses_around_truth(5, 0.005, 0.05)
+    found = fitted(energy_of(AT_ODDS, wide), twists_of(SE3Space(), pivot), poses, 1)
+    points = np.concatenate([AT_ODDS.known, AT_ODDS.free, AT_ODDS.occupied])
+    known, free = len(AT_ODDS.known), len(AT_ODDS.free)
+    for before, after in zip(poses.matrices, found.matrices, strict=True):
+        places = apply(before, points)
+        residuals, normals = BOX_GRID.at(places, lookup="trilinear")
+        residuals[:known] -= AT_ODDS.sdf
+        bell = np.exp(-0.5 * (residuals / sigma) ** 2) / (math.sqrt(2.0 * math.pi) * sigma)
+        own = (1.0 - SHARE) * bell / ((1.0 - SHARE) * bell + SHARE / EXTENT)  # not foreign
+        weights = np.where(np.arange(len(points)) < known, own / sigma**2, 1.0 / softness**2)
+        weights[known : known + free] *= residuals[known : known + free] < 0.0
+        weights[known + free :] *= residuals[known + free :] > 0.0
+        rates = np.hstack([np.cross(places - pivot, normals) / 0.15, normals])
+        normal, right = rates.T @ (weights[:, None] * rates), rates.T @ (weights * residuals)
+        step = -np.linalg.solve(normal + 0.01 * np.trace(normal) / 6.0 * np.eye(6), right)
+        turn, shift = step[:3] / 0.15, step[3:]
+        half = math.sqrt(turn @ turn) / 2.0
+        turning = axis_angle(turn / (2.0 * half), np.array(2.0 * math.atan(half)))
+        moved = compose(turning, pivot + shift - turning @ pivot) @ before
+        np.testing.assert_allclose(after, moved, atol=1e-4)  # tables of slopes
+        assert np.abs(after - before).max() > 0.01
 
 
 def test_moves_turn_about_a_contact_or_the_centre_and_shift():
