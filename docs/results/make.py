@@ -1,8 +1,8 @@
 """`python -m docs.results.make`: docs/results.md, docs/benchmark.md and the README's numbers.
 
-python -m docs.results.make                  write the pages from the tables in this folder
+python -m docs.results.make                   write the pages from the tables in this folder
 python -m docs.results.make store FOLDER ...  put evaluations here first, under their names
-python -m docs.results.make rank FOLDER      put an evaluation of one's own beside that here
+python -m docs.results.make rank FOLDER       show an evaluation of your own beside that here
 """
 
 from __future__ import annotations
@@ -226,7 +226,8 @@ def rank(folder: Path) -> Iterator[str | Table]:
     if kind == "probes":
         yield from sections.short_tables(both)
     else:
-        yield sections.against_baseline(both, PACKAGE)[0]
+        beside = PACKAGE if PACKAGE in both.methods else "chsel"
+        yield sections.against_baseline(both, beside)[0]
 
 
 def ranked(name: str, to: str) -> list[str]:
