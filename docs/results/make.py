@@ -57,7 +57,7 @@ def stored() -> list[str]:
 
 
 def table(name: str, title: str, baseline: str | None = None, without: str = "") -> str:
-    """A table of the report of an evaluation, by its title; without: columns, by commas."""
+    """A table of the report of an evaluation, by its title; without: columns, by semicolons."""
     found = [
         table
         for section in sections.sections_of(evaluation(name), baseline)
@@ -65,7 +65,7 @@ def table(name: str, title: str, baseline: str | None = None, without: str = "")
         if table.title == title
     ]
     (one,) = found
-    out = [n for n, head in enumerate(one.header) if head not in without.split(", ")]
+    out = [n for n, head in enumerate(one.header) if head not in without.split("; ")]
     rows = [[row[n] for n in out] for row in [one.header, *one.rows]]
     rows.insert(1, [":--"] * one.labels + ["--:"] * (len(out) - one.labels))
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
@@ -88,6 +88,17 @@ def ratio(name: str, method: str, to: str, **where: Any) -> str:
     own = _chosen(_with_ratios(name, to), {"method": method, **where})
     mean, lower, upper = statistics.ratio_interval(own)
     return with_range(mean, lower, upper) + (", within noise" if lower <= 1.0 <= upper else "")
+
+
+def worse(name: str, methods: list[str], to: str) -> str:
+    """Whether methods have a higher PD than another one, beyond their intervals."""
+    intervals = [
+        statistics.ratio_interval(_chosen(_with_ratios(name, to), {"method": method}))
+        for method in methods
+    ]
+    if all(lower > 1.0 for _, lower, _ in intervals):
+        return "yes"
+    return "no" if all(upper < 1.0 for *_, upper in intervals) else "within noise"
 
 
 def better(name: str, method: str, than: str, **where: Any) -> str:
@@ -143,12 +154,6 @@ def digest(name: str) -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
 
 
-def commands(*names: str) -> str:
-    """The commands that made evaluations, to be copied."""
-    lines = [line for name in names for line in evaluation(name).experiment["commands"]]
-    return "```sh\n" + "\n".join(dict.fromkeys(lines)) + "\n```"
-
-
 def definition(name: str) -> str:
     """The plausible sets behind an evaluation's PD, if it has any."""
     every = evaluation(name)
@@ -198,6 +203,8 @@ def speeds(problems: Mapping[str, str], columns: Mapping[str, str]) -> str:
 def store(folder: Path) -> None:
     """Put the tables of an evaluation here, smaller, and without those of single machines."""
     experiment = json.loads((folder / "experiment.json").read_text())
+    outside = experiment["outside"]
+    experiment["outside"] = {name: Path(path).name for name, path in outside.items()}
     to = HERE / experiment["name"]
     to.mkdir(exist_ok=True)
     (to / "experiment.json").write_text(json.dumps(experiment, indent=1) + "\n")
