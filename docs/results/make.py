@@ -254,7 +254,7 @@ def write(checked: bool = False) -> list[Path]:
     blocks = engine.get_template("README.md.j2").module
 
     def filled(match: re.Match[str]) -> str:
-        return f"{match[1]}{getattr(blocks, match[2])()}\n{match[3]}"
+        return f"{match[1]}{str(getattr(blocks, match[2])()).strip()}\n{match[3]}"
 
     texts[README] = _BLOCK.sub(filled, README.read_text())
     stale = [page for page, text in texts.items() if not page.exists() or page.read_text() != text]
