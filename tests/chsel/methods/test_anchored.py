@@ -243,10 +243,13 @@ def test_rounds_of_more_than_three_contacts_leave_one_out_in_turn(monkeypatch, c
 
 def test_the_twin_of_a_nearly_symmetric_object_is_found_from_the_other():
     """Contacts lie half way between a box and the same box turned; one pose is sampled."""
-    sdf = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.106, 0.16)), 0.005)
+    centre = np.array([0.03, -0.02, 0.01])
+    mesh = trimesh.creation.box((0.1, 0.106, 0.16)).apply_translation(centre)
+    sdf = SdfGrid.from_mesh(mesh, 0.005)
     between = trimesh.creation.box((0.103, 0.103, 0.16))
-    contacts = apply(TRUTH, np.asarray(trimesh.sample.sample_surface(between, 40, seed=1)[0]))
-    quarter = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5 * np.pi)), np.zeros(3))
+    contacts = apply(TRUTH, centre + trimesh.sample.sample_surface(between, 40, seed=1)[0])
+    turn = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5 * np.pi))
+    quarter = compose(turn, centre - turn @ centre)
     both = Poses.of(inverse(np.stack([TRUTH, TRUTH @ quarter])))
     assert outline_distances_to(sdf, both[:1], both[1:])[0] > 0.002
     method, start = anchored(replace(EFFORT, samples=1)), np.repeat(both.matrices[:1], 9, axis=0)
