@@ -243,7 +243,7 @@ def test_rounds_of_more_than_three_contacts_leave_one_out_in_turn(monkeypatch, c
 
 def test_the_twin_of_a_nearly_symmetric_object_is_found_from_the_other():
     """Contacts lie half way between a box and the same box turned; one pose is sampled."""
-    centre = np.array([0.03, -0.02, 0.01])
+    centre = np.array([0.15, -0.1, 0.05])
     mesh = trimesh.creation.box((0.1, 0.106, 0.16)).apply_translation(centre)
     sdf = SdfGrid.from_mesh(mesh, 0.005)
     between = trimesh.creation.box((0.103, 0.103, 0.16))
