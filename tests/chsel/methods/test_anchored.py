@@ -25,7 +25,17 @@ from chsel.problem.streams import StreamKey
 from chsel.problem.subset import surface_descriptors
 from chsel.problem.surface import outline_distances_to
 from chsel.problem.trust import trust_in
-from tests.chsel.methods.scene import GRID, ODD, POINTS, SIDE, TRUTH, Watcher, known_points, posed
+from tests.chsel.methods.scene import (
+    GRID,
+    ODD,
+    POINTS,
+    SIDE,
+    TRUTH,
+    Watcher,
+    around_truth,
+    known_points,
+    posed,
+)
 from tests.chsel.samples import hypotheses_at, plain_energies
 
 EFFORT = Effort(
@@ -262,6 +272,17 @@ def test_the_twin_of_a_nearly_symmetric_object_is_found_from_the_other():
     trust = trust_by(build_method("icp"), problem, alone)  # which searches for rivals
     assert trust is not None
     assert str(trust).startswith("determined up to a turn of ")
+
+
+def test_the_better_poses_are_fitted_and_the_others_stay():
+    method = anchored(replace(EFFORT, refined=2))
+    search = Search(posed(method), method.settings, NullObserver())
+    before = search.rated(Poses.of(around_truth(6)))
+    after = search.refined(before)
+    assert (np.diff(after.energies) >= 0.0).all()
+    assert after.energies[1] < before.energies[0]
+    np.testing.assert_array_equal(after.energies[2:], before.energies[2:])
+    np.testing.assert_array_equal(after.poses.numbers[2:], before.poses.numbers[2:])
 
 
 def test_poses_are_held_that_errors_shared_by_all_points_explain():
