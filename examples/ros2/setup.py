@@ -2,7 +2,7 @@ from setuptools import setup
 
 setup(
     name="chsel_touch",
-    version="0.1.0",
+    version="0.2.0",
     packages=["chsel_touch"],
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/chsel_touch"]),

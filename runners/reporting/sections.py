@@ -71,8 +71,8 @@ _TEXTS = {  # of sections, by title
     "a hypothesis and in the true pose, on average over the set; before the first contact, of the "
     "poses that the free space allows. Spread: the same between two poses of the belief. Geometric "
     "means over the {count} trials that all policies have finished ({left_out} are left out), with "
-    "95 % intervals by a bootstrap over configurations; errors below "
-    f"{_MM * LEAST_ERROR:g} mm count as {_MM * LEAST_ERROR:g} mm.",
+    "95 % intervals by a bootstrap over configurations, or over sessions if these are few; errors "
+    f"below {_MM * LEAST_ERROR:g} mm count as {_MM * LEAST_ERROR:g} mm.",
     "Probes needed": "After how many probes the error of the set first is below a limit. A session "
     "that does not get there within {budget} probes counts as needing more (Kaplan-Meier). A "
     f"session is solvable if any policy gets below {_MM * GOOD:g} mm in it.",
@@ -265,7 +265,7 @@ def against_baseline(evaluation: Evaluation, baseline: str) -> list[Table]:
                 "n": f"{diversity.count()}" + (f" ({left_out} left out)" if left_out else ""),
                 "PD in mm², median [quartiles]": with_range(median, lower, upper),
                 "geometric mean": geometric_mean(own["floored"]),
-                f"ratio to {baseline} [95 %]": _ratio_cell(own),
+                f"ratio to {baseline} [95 %]": with_range(*statistics.ratio_interval(own)),
                 "worse": "-" if method == baseline else worse,
                 "members": percent(own["exact_members"].mean()),
                 "distinct [least]": f"{number(distinct.mean())} [{number(distinct.min())}]",
@@ -282,11 +282,6 @@ def against_baseline(evaluation: Evaluation, baseline: str) -> list[Table]:
         found = rows.groupby([by, "method"])["ratio"].agg(geometric_mean).map(number).unstack()
         tables.append(pivot_table(f"Ratios of PD by {by}, geometric means", found, styles))
     return tables
-
-
-def _ratio_cell(rows: pd.DataFrame) -> str:
-    mean, lower, upper = statistics.ratio_interval(rows)
-    return with_range(mean, lower, upper) if math.isfinite(lower) else number(mean)
 
 
 def pd_over_probes(name: str, rows: pd.DataFrame, styles: Styles) -> Picture | None:
@@ -435,7 +430,7 @@ def _compared(sessions: SteeredSessions, styles: Styles) -> list[Table]:
         line |= {"sign test, p": f"{of['sign_test']:.2g}", "ratio, median": of["median"]}
         mean = with_range(of["mean"], of["lower"], of["upper"])
         lines.append(line | {"ratio, geometric mean [95 %]": mean})
-    note = "Intervals by a bootstrap over configurations; the sign test is over sessions."
+    note = "Intervals by a bootstrap over configurations, or over sessions if these are few."
     title = f"Error beside {reference} after {sessions.compared} probes"
     tables = [table_of(title, lines, note=note)]
     ratios = statistics.ratios_to_best(sessions).dropna()

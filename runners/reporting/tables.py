@@ -51,8 +51,9 @@ def number(value: float) -> str:
 
 
 def with_range(value: float, lower: float, upper: float) -> str:
-    """A number and a range, such as quartiles: "26.1 [17.5, 37.5]"."""
-    return f"{number(value)} [{number(lower)}, {number(upper)}]" if math.isfinite(lower) else "-"
+    """A number and a range, such as quartiles: "26.1 [17.5, 37.5]"; alone if that is NaN."""
+    known = f" [{number(lower)}, {number(upper)}]" if math.isfinite(lower) else ""
+    return number(value) + known
 
 
 def percent(share: float) -> str:

@@ -14,6 +14,7 @@ from runners.reporting.statistics import (
     ratios_to_best,
     steered_sessions,
 )
+from runners.reporting.tables import with_range
 from tests.runners.in_process import run
 from tests.runners.made_up_evaluations import session, tables_of, write_sessions
 
@@ -97,6 +98,13 @@ def test_the_interval_of_a_mean_is_that_of_independent_configurations():
     half = 1.96 * values.std() / 200**0.5  # three alike seeds are no more than one
     assert lower == pytest.approx(values.mean() - half, abs=0.02)
     assert upper == pytest.approx(values.mean() + half, abs=0.02)
+
+
+def test_a_single_session_has_no_interval_but_its_number():
+    index = pd.MultiIndex.from_tuples([("can", 20)], names=["configuration", "seed"])
+    interval = bootstrap_interval(pd.Series([0.5], index))
+    assert np.isnan(interval).all()
+    assert with_range(0.5, *interval) == "0.5"
 
 
 def test_tables_have_the_numbers_of_the_sessions(tmp_path, rows):
