@@ -156,8 +156,9 @@ class PoseBelief:
         for n, first in enumerate(firsts):
             members = np.flatnonzero(mode == n)
             weight = len(members) / len(mode)
-            covariance = self._covariance(int(first), members)
             best = self.object_from_world[first]
+            off = pose_offsets(self._symmetry, best, self.object_from_world[members])
+            covariance = np.asarray((off[:, :, None] * off[:, None]).mean(axis=0))
             found.append(Mode(numbers[n], weight, best, covariance, members))
         return found
 
@@ -180,16 +181,6 @@ class PoseBelief:
             if n not in given:
                 given[n], self.numbers = self.numbers, self.numbers + 1
         return [given[n] for n in range(len(firsts))]
-
-    def _covariance(self, first: int, members: IntArray) -> FloatArray:
-        """Mean products (6, 6) of how members differ from the best of their mode."""
-        world_from_object = inverse(self.object_from_world[[first, *members]])
-        centres = apply(world_from_object[1:], self._symmetry.centre[None])[:, 0]
-        centre = apply(world_from_object[:1], self._symmetry.centre[None])[0, 0]
-        own, others = world_from_object[0, :3, :3], world_from_object[1:, :3, :3]
-        turns = product(_nearest_alike(self._symmetry, own, others), own.T)  # in world axes
-        vectors = np.concatenate([centres - centre, _rotation_vectors(turns)], axis=1)
-        return np.asarray((vectors[:, :, None] * vectors[:, None]).mean(axis=0))
 
     def event(self, step: int) -> Believed:
         """As recordings of a session have it."""
@@ -261,22 +252,9 @@ class PoseBelief:
         the hand opens so far.
         """
         gripper = gripper or Gripper()
-        poses = frozen("world_from_gripper", world_from_gripper, (None, 4, 4), error=PoseError)
-        poses = nearest_rigid("world_from_gripper", poses)
-        widths = np.broadcast_to(np.asarray(width, dtype=np.float64), (len(poses),))
-        if not ((widths > 0.0) & np.isfinite(widths)).all():
-            raise SettingError("width is not above 0; accepted: metres between the fingers")
-        fingers, between = _nodes(gripper)
-        own = np.concatenate([fingers, between])  # of width 1, but for the fingers' thickness
-        count = len(fingers)
-        local = np.broadcast_to(own, (len(poses), *own.shape)).copy()
-        local[:, :count, 1] += np.sign(own[:count, 1]) * 0.5 * widths[:, None]
-        local[:, count:, 1] *= widths[:, None]
-        world = rotated(poses[:, None, :3, :3], local) + poses[:, None, :3, 3]
-        inside = self._distances(world.reshape(-1, 3)) < 0.0
-        inside = inside.reshape(len(self), len(poses), len(own))
-        free, held = ~inside[..., :count].any(axis=-1), inside[..., count:].any(axis=-1)
-        return self._chances(free & held & (widths <= gripper.opening))
+        return self._chances(
+            grasps_work(self._sdf, self._poses, world_from_gripper, width, gripper)
+        )
 
     def best_grasp(
         self, object_from_gripper: Any, width: Any, gripper: Gripper | None = None
@@ -327,6 +305,44 @@ class PoseBelief:
         file = io.BytesIO()
         figure.savefig(file, format="png", dpi=80)
         return file.getvalue()
+
+
+def grasps_work(
+    sdf: SdfGrid, poses: Poses, world_from_gripper: Any, width: Any, gripper: Gripper
+) -> np.ndarray:
+    """Whether each grasp (G,) works on the object at each of poses: flags (K, G).
+
+    world_from_gripper, width: as `PoseBelief.grasp_chance` takes them.
+    """
+    grasps = frozen("world_from_gripper", world_from_gripper, (None, 4, 4), error=PoseError)
+    grasps = nearest_rigid("world_from_gripper", grasps)
+    widths = np.broadcast_to(np.asarray(width, dtype=np.float64), (len(grasps),))
+    if not ((widths > 0.0) & np.isfinite(widths)).all():
+        raise SettingError("width is not above 0; accepted: metres between the fingers")
+    fingers, between = _nodes(gripper)
+    own = np.concatenate([fingers, between])  # of width 1, but for the fingers' thickness
+    count = len(fingers)
+    local = np.broadcast_to(own, (len(grasps), *own.shape)).copy()
+    local[:, :count, 1] += np.sign(own[:count, 1]) * 0.5 * widths[:, None]
+    local[:, count:, 1] *= widths[:, None]
+    world = rotated(grasps[:, None, :3, :3], local) + grasps[:, None, :3, 3]
+    inside = signed_distances(sdf, poses, world.reshape(-1, 3)) < 0.0
+    inside = inside.reshape(len(poses), len(grasps), len(own))
+    free, held = ~inside[..., :count].any(axis=-1), inside[..., count:].any(axis=-1)
+    return np.asarray(free & held & (widths <= gripper.opening))
+
+
+def pose_offsets(symmetry: ObjectSymmetry, own: FloatArray, others: FloatArray) -> FloatArray:
+    """How other poses (M, 4, 4), object_from_world, are off from one (4, 4): vectors (M, 6).
+
+    Of the object's centre (metres) and the rotation vector (radians), both in world axes, after
+    the symmetry of the object that brings each of the others nearest.
+    """
+    world_from_object = inverse(np.concatenate([own[None], others]))
+    centres = apply(world_from_object, symmetry.centre[None])[:, 0]
+    rotations = world_from_object[:, :3, :3]
+    turns = product(_nearest_alike(symmetry, rotations[0], rotations[1:]), rotations[0].T)
+    return np.concatenate([centres[1:] - centres[0], _rotation_vectors(turns)], axis=1)
 
 
 def wilson(share: Any, count: int) -> Chances:

@@ -44,6 +44,7 @@ class Purpose(IntEnum):
     PRIOR_BELIEF = 18
     POLICY = 19
     PUSHES = 20
+    GRASPS = 21
 
 
 @dataclass(frozen=True)

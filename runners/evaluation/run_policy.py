@@ -6,7 +6,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import trimesh
 
+from chsel.belief import Gripper, PoseBelief, grasps_work, pose_offsets
 from chsel.next_probe.decision_problem import Belief, Decision
 from chsel.next_probe.forecast import belief_after, belief_before
 from chsel.numerics.arrays import FloatArray
@@ -14,9 +16,9 @@ from chsel.plausible.symmetry import object_symmetry
 from chsel.policies.policy import PolicySettings, StopSettings
 from chsel.problem import surface
 from chsel.problem.online_registration import OnlineRegistration
-from chsel.problem.poses import Poses, inverse
+from chsel.problem.poses import Poses, compose, inverse, random_rotations, rotated
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.streams import StreamKey
+from chsel.problem.streams import Purpose, StreamKey, uniforms
 from chsel.rehearsal import warm_up, warm_up_policy
 from chsel.session import Session
 from runners.evaluation.contenders import Contender
@@ -26,6 +28,10 @@ from runners.evaluation.trial_session import StepRecorder, config_values, probe_
 from runners.run.recording import RecordingConfig
 from runners.run.scene import Scene, open_scene, session_started
 from runners.run.session_run import steps
+
+_GRASPS = 40  # that a belief is asked about
+_MIDDLES = {"middle_50": 0.25, "middle_90": 0.05}  # of the members: where they begin
+_WIDEST = 3  # directions
 
 
 def policy_rows(
@@ -106,6 +112,9 @@ def _row(
             "problem_digest": session.problem.digest,
             "seconds": session.registered.total_seconds,
         }
+        if hypotheses.trust is not None:
+            pose, at = scene.session.world_from_object, StreamKey(seed, session.step)
+            row |= belief_numbers(session.belief, scene.mesh, scene.sdf, pose, at)
     if after is None:
         return row | {"stop": usual_stop(row["spread"], None)}
     spread, promised = after.decision.spread, promised_gain(after.decision)
@@ -117,6 +126,37 @@ def _row(
         "decision_digest": after.decision.digest,
         "stop": usual_stop(spread, promised) or after.decision.stop,
     }
+
+
+def belief_numbers(
+    belief: PoseBelief,
+    mesh: trimesh.Trimesh,
+    sdf: SdfGrid,
+    world_from_object: FloatArray,
+    key: StreamKey,
+) -> Row:
+    """How far a belief is right about the true pose (4, 4), and about grasps."""
+    symmetry = object_symmetry(mesh)
+    truth, members = inverse(world_from_object), belief.object_from_world
+    off = pose_offsets(symmetry, members[0], np.concatenate([truth[None], members]))
+    off[:, 3:] *= 0.25 * sdf.diameter  # metres
+    off -= off[1:].mean(axis=0)
+    directions = np.linalg.eigh(off[1:].T @ off[1:])[1][:, -_WIDEST:]
+    true, along = off[0] @ directions, off[1:] @ directions
+    row: dict[str, Any] = {}
+    for name, first in _MIDDLES.items():
+        lower, upper = np.quantile(along, [first, 1.0 - first], axis=0)
+        row[name] = float(((lower <= true) & (true <= upper)).mean())
+    stream = key.stream(Purpose.GRASPS)
+    drawn = inverse(members[uniforms(stream, 0, len(members), _GRASPS).astype(int)])
+    lower, upper = mesh.bounds
+    held = rotated(drawn[:, :3, :3], uniforms(stream, lower, upper, (_GRASPS, 3))) + drawn[:, :3, 3]
+    grasps, gripper = compose(random_rotations(stream, _GRASPS), held), Gripper()
+    chance = belief.grasp_chance(grasps, gripper.opening).chance
+    best = int(np.argmax(chance))
+    there = Poses.of(truth[None])
+    works = grasps_work(sdf, there, grasps[[best]], gripper.opening, gripper)
+    return row | {"grasp_chance": float(chance[best]), "grasp_works": bool(works[0, 0])}
 
 
 def _belief(

@@ -82,6 +82,8 @@ def _table(folder: Path, experiment: Mapping[str, Any], name: str) -> pd.DataFra
             if there
             else gathered(folder, experiment, name)
         )
+        # Older tables do not have all columns.
+        table = pa.concat_tables([TABLES[name].empty_table(), table], promote_options="default")
     rows = table.to_pandas(types_mapper={pa.int64(): pd.Int64Dtype()}.get)
     numbers = rows.select_dtypes("float64")
     rows[numbers.columns] = numbers.where(numbers.abs() < math.inf)

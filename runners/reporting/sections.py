@@ -81,6 +81,8 @@ _TEXTS = {  # of sections, by title
     "Calibration of forecasts and of stopping": "Hits: the chance that was forecast for the chosen "
     "probe, and how often such probes met the object. Stops: the first probe with so small a "
     f"spread of the belief; good if the error then is at most {_STOP_FACTOR:g} times it.",
+    "Calibration of beliefs": "Members of registrations of all policies, as `session.belief` has "
+    "them. Of 40 grasps drawn at members the best is taken, of the size of a Franka Panda hand.",
     "Time per decision and registration": "Wall-clock time of choosing the next probe, of the "
     f"registration before it, and of both together, {_BUSY}",
 }
@@ -108,6 +110,8 @@ _TRUE_POSES = {  # heading: number of a session.json, factor
     "from the simulated truth, mm": ("from_known.position", _MM),
     "from the simulated truth, degrees": ("from_known.rotation", degrees(1.0)),
 }
+_CONTACTS = (1, 4), (5, 8), (9, 12), (13, 99)  # of a registration
+_MIDDLES = {"middle_50": "in the middle 50 %", "middle_90": "in the middle 90 %"}
 _OVER_PROBES = {"error": "error of the set, mm", "spread": "spread of the belief, mm"}
 
 Part = tuple[str, Sequence[Table], Picture | None]  # title, tables, picture of a section
@@ -350,12 +354,14 @@ def _on_policies(
     spread = _means_table(sessions, styles, "spread", "Spread of the belief, mm")
     errors = [error_table(sessions, styles), spread]
     calibrated = [*_hit_tables(sessions, styles), _stops_table(sessions, styles)]
+    beliefs = _belief_tables(sessions)
     parts = [
         run,
         ("Error and spread over probes", errors, _means_over_probes(sessions, every)),
         ("Probes needed", [needed_table(sessions, styles)], None),
         ("Policies compared, session by session", _compared(sessions, styles), None),
         ("Calibration of forecasts and of stopping", calibrated, None),
+        ("Calibration of beliefs", beliefs, None),
         ("Time per decision and registration", [_decision_times(sessions.rows, styles)], None),
     ]
     return parts, numbers
@@ -475,13 +481,38 @@ def _hit_tables(sessions: SteeredSessions, styles: Styles) -> list[Table]:
             texts = {"forecast": f"{forecast:.1f}", "happened": f"{happened:.1f}"}
             texts["difference, points"] = f"{forecast - happened:+.1f}"
             lines.append({"policy": title, "probes": len(own), **texts})
-    bins = []
-    for tenth, of in statistics.hit_bins(rows).iterrows():
-        line = {"forecast": f"{10 * tenth} to {10 * tenth + 10} %", "probes": int(of["total"])}
-        line["mean forecast"] = f"{100.0 * of['forecast']:.0f} %"
-        bins.append(line | {"happened [95 %]": percent_range(of)})
     means = table_of("Chance of a hit, forecast and happened, %", lines)
+    bins = _tenths(rows, "hit_forecast", "hit", "probes")
     return [means, table_of("Hits by their forecast, all policies", bins)]
+
+
+def _tenths(rows: pd.DataFrame, forecast: str, happened: str, counted: str) -> list[dict[str, Any]]:
+    """A line for every tenth of a chance, with what happened."""
+    lines = []
+    for tenth, of in statistics.by_tenths(rows, forecast, happened).iterrows():
+        line = {"forecast": f"{10 * tenth} to {10 * tenth + 10} %", counted: int(of["total"])}
+        line["mean forecast"] = f"{100.0 * of['forecast']:.0f} %"
+        lines.append(line | {"happened [95 %]": percent_range(of)})
+    return lines
+
+
+def _belief_tables(sessions: SteeredSessions) -> list[Table]:
+    """Whether the middle of the members has the true pose, and whether grasps work as told."""
+    rows = sessions.rows[sessions.rows["grasp_chance"].notna()]
+    lines = []
+    for first, last in _CONTACTS:
+        own = rows[rows["contacts"].between(first, last)]
+        if len(own):
+            line = {"contacts": f"{first} to {last}", "registrations": len(own)}
+            line |= {name: percent(own[column].mean()) for column, name in _MIDDLES.items()}
+            line["best grasp said to work"] = percent(own["grasp_chance"].mean())
+            lines.append(line | {"works": _share(own["grasp_works"])})
+    bins = _tenths(rows, "grasp_chance", "grasp_works", "grasps")
+    note = "The true pose along the three directions in which members spread the most."
+    return [
+        table_of("Beliefs by the number of contacts", lines, note=note),
+        table_of("Grasps by the chance that they work", bins),
+    ]
 
 
 def _stops_table(sessions: SteeredSessions, styles: Styles) -> Table:

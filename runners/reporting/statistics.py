@@ -111,12 +111,12 @@ def censored_quantile(numbers: pd.Series, share: float) -> float:
     return float(np.quantile(numbers, share, method="inverted_cdf")) if len(numbers) else math.nan
 
 
-def hit_bins(rows: pd.DataFrame) -> pd.DataFrame:
-    """`shares` of hits by tenths of their forecast, with the mean `forecast` of each."""
-    tenths = np.digitize(rows["hit_forecast"], np.linspace(0.0, 1.0, 11)).clip(max=10) - 1
+def by_tenths(rows: pd.DataFrame, forecast: str, happened: str) -> pd.DataFrame:
+    """`shares` of what happened by tenths of the forecast, with the mean `forecast` of each."""
+    tenths = np.digitize(rows[forecast], np.linspace(0.0, 1.0, 11)).clip(max=10) - 1
     rows = rows.assign(tenth=tenths)
-    forecasts = rows.groupby("tenth")["hit_forecast"].mean()
-    return shares(rows, "tenth", "hit").join(forecasts.rename("forecast"))
+    forecasts = rows.groupby("tenth")[forecast].mean()
+    return shares(rows, "tenth", happened).join(forecasts.rename("forecast"))
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,17 +6,22 @@ import re
 import numpy as np
 import pyarrow.parquet
 import pytest
+import trimesh
 
+from chsel.belief import PoseBelief
 from chsel.errors import SettingError
 from chsel.methods.anchored.anchored import Anchored
-from chsel.problem.poses import Poses, apply, inverse
+from chsel.problem.poses import Poses, apply, compose, inverse
+from chsel.problem.registration_problem import Hypotheses, Trust
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
 from chsel.problem.surface import outline_in_world
 from replay.mcap.reader import read_recording
 from runners import evaluate, probe
 from runners.evaluation.contenders import chosen_policies
 from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.plan import Task, Trial
-from runners.evaluation.run_policy import spread_of, usual_stop
+from runners.evaluation.run_policy import belief_numbers, spread_of, usual_stop
 from tests.runners.in_process import do_task, run
 from tests.runners.test_evaluate import stamps
 from tests.runners.test_evaluation import plan_in
@@ -69,7 +74,7 @@ def test_every_probe_has_a_row_that_the_recording_confirms(folder):
             found = recording.hypotheses(row["step"]).object_from_world
             assert row["error"] == pytest.approx(mean_error(recording.start, found).mean())
         else:
-            assert (row["digest"], row["seconds"]) == (None, None)
+            assert (row["digest"], row["seconds"], row["grasp_chance"]) == (None, None, None)
             assert row["error"] == row["belief_error"]
         if row["policy"] == "information":
             check_decision(row, recording)
@@ -114,6 +119,44 @@ def test_the_usual_rules_stop_at_a_narrow_belief_or_where_little_is_promised():
     assert usual_stop(0.004, 0.05) == "spread"
     assert usual_stop(0.1, 0.0001) == "gain"
     assert usual_stop(0.1, 0.05) == usual_stop(0.1, None) == ""
+
+
+def believed(sdf, world_from_object):
+    """The belief of members at these poses (K, 4, 4)."""
+    count = len(world_from_object)
+    none = np.zeros(count, dtype=bool), np.full(count, -1), np.zeros((0, 4, 4))
+    trust = Trust(0.001, 0.0, 0.5, 0, 0.01, "wide", 6, ())
+    found = Hypotheses(inverse(world_from_object), np.arange(count) * 1.0, *none, trust=trust)
+    return PoseBelief(sdf, found)
+
+
+def test_the_middle_of_the_members_has_the_true_pose_or_not():
+    mesh = trimesh.creation.box([0.05, 0.06, 0.07])
+    sdf = SdfGrid.from_mesh(mesh, 0.005)
+    x, y, z = np.meshgrid(*(np.linspace(0.0, side, 11) for side in (0.2, 0.1, 0.4)), indexing="ij")
+    places = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    members = compose(np.broadcast_to(np.eye(3), (len(places), 3, 3)), places)
+    key = StreamKey(0, 0)
+    for place, middles in (
+        ([0.11, 0.05, 0.2], (1, 1)),
+        ([0.11, 0.09, 0.2], (2 / 3, 1)),
+        ([0.11, 0.09, 0.6], (1 / 3, 2 / 3)),
+        ([0.3, 0.2, 0.6], (0, 0)),
+    ):
+        truth = compose(np.eye(3), np.array(place))
+        row = belief_numbers(believed(sdf, members), mesh, sdf, truth, key)
+        assert (row["middle_50"], row["middle_90"]) == pytest.approx(middles)
+
+
+def test_the_best_grasp_works_where_most_members_have_the_object():
+    mesh = trimesh.creation.box([0.05, 0.06, 0.07])
+    sdf = SdfGrid.from_mesh(mesh, 0.005)
+    here, there = np.eye(4), compose(np.eye(3), np.array([0.0, 1.0, 0.0]))
+    belief = believed(sdf, np.stack([here, here, there]))
+    for truth, works in ((here, True), (there, False)):
+        row = belief_numbers(belief, mesh, sdf, truth, StreamKey(0, 0))
+        assert row["grasp_chance"] == pytest.approx(2 / 3)
+        assert row["grasp_works"] is works
 
 
 def test_sessions_are_those_of_runners_probe(folder, tmp_path):

@@ -29,6 +29,8 @@ def sessions_of(folder, rows, reference=None):
 def rows():
     """Three trials of two policies."""
     forecasts = {"hit_forecast": [1.0, 0.85, 0.15, 0.85], "hit": [True, True, False, False]}
+    forecasts |= {"grasp_chance": [None, 0.75, 0.72, 1.0], "grasp_works": [None, False, True, True]}
+    forecasts |= {"middle_50": [None, 1 / 3, 1.0, 0.0], "middle_90": [None, 2 / 3, 1.0, 1.0]}
     return [
         *session("can", 20, "information", [80.0, 8.0, 4.0, 2.0], **forecasts),
         *session("can", 20, "grid", [80.0, 40.0, 20.0, 10.0]),
@@ -136,6 +138,12 @@ def test_tables_have_the_numbers_of_the_sessions(tmp_path, rows):
     assert bins[1:] == [
         ["10 to 20 %", "1", "15 %", "0 % [0, 79]"],
         ["80 to 90 %", "2", "85 %", "50 % [9, 91]"],
+        ["90 to 100 %", "1", "100 %", "100 % [21, 100]"],
+    ]
+    beliefs = tables["Beliefs by the number of contacts"]
+    assert beliefs[1:] == [["1 to 4", "3", "44.4 %", "88.9 %", "82.3 %", "67 % [21, 94]"]]
+    assert tables["Grasps by the chance that they work"][1:] == [
+        ["70 to 80 %", "2", "74 %", "50 % [9, 91]"],
         ["90 to 100 %", "1", "100 %", "100 % [21, 100]"],
     ]
     stops = tables["Stopping by the spread of the belief"]
