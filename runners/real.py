@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,9 +31,11 @@ from chsel.problem.settings import CheckedSettings, build_settings
 from chsel.problem.streams import Purpose, StreamKey, uniforms
 from chsel.rehearsal import warm_up
 from replay.console import Console, Progress
+from replay.environment import environment
 from replay.files import whole_file
 from runners.command.program import command, plain
 from runners.evaluation.contenders import chosen_contenders
+from runners.evaluation.experiment import this_command
 from runners.evaluation.trial_configurations import chosen_names, chosen_seeds
 from runners.reporting.tables import Table, print_table, table_of
 from runners.run.display import compiling_line
@@ -40,6 +43,8 @@ from runners.run.scene import PresetName
 from runners.sensors.depth_frame import SUFFIXES as FRAMES
 from runners.sessions.problem_source import open_source
 
+MADE = "made.json"
+"""What made results.csv, beside it."""
 _RIGHT = (0.005, pi / 36.0)  # m and radians (5 degrees): errors of a hypothesis that is right
 _EPSILON = 0.001  # m, of plausible sets, which are not made here
 _SPLIT = 1  # the random stream, of a seed, that halves the touches
@@ -103,7 +108,10 @@ def main(config: DictConfig) -> None:
     file = Path(checked.out).expanduser() / "results.csv"
     with whole_file(file) as beside:
         pa.csv.write_csv(pa.Table.from_pylist(rows), beside)
-    print_table(console, _table(pd.DataFrame(rows)))
+    made = {"commands": [this_command()], "environments": [environment()]}
+    with whole_file(file.with_name(MADE)) as beside:
+        beside.write_text(json.dumps(made, indent=1) + "\n")
+    print_table(console, medians(pd.DataFrame(rows)))
     console.print(str(file), soft_wrap=True)
 
 
@@ -176,7 +184,7 @@ class RealCase:
         return numbers | {"seconds": seconds, "digest": found.digest}
 
 
-def _table(rows: pd.DataFrame) -> Table:
+def medians(rows: pd.DataFrame) -> Table:
     """Medians over seeds of every case and method."""
     lines = []
     for (case, method), own in rows.groupby(["case", "method"], sort=False):

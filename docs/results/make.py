@@ -10,8 +10,9 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import shutil
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -23,6 +24,7 @@ import pyarrow.parquet
 
 from replay.console import Console
 from runners.evaluation.experiment import TABLES
+from runners.real import MADE, medians
 from runners.reporting import sections, statistics
 from runners.reporting.evaluation_folder import TRIAL, Evaluation, open_evaluation
 from runners.reporting.figures import styles_of
@@ -42,6 +44,7 @@ README = DOCS.parent / "README.md"
 _BLOCK = re.compile(r"(<!-- ([a-z_]+) of docs/results -->\n).*?(<!-- end -->)", re.DOTALL)
 _KEYS = [*TRIAL, "faults", "step", "method", "policy", "draw"]
 _TIMES = ["seconds", "decision_seconds"]
+REAL = "real"  # results of runners.real
 PACKAGE = "package"  # with which methods are compared
 
 
@@ -56,6 +59,14 @@ def stored() -> list[str]:
     return sorted(path.parent.name for path in HERE.glob("*/experiment.json"))
 
 
+def _markdown(table: Table, without: Sequence[str] = ()) -> str:
+    """A table of a report; without: columns."""
+    out = [n for n, head in enumerate(table.header) if head not in without]
+    rows = [[row[n] for n in out] for row in [table.header, *table.rows]]
+    rows.insert(1, [":--"] * table.labels + ["--:"] * (len(out) - table.labels))
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+
+
 def table(name: str, title: str, baseline: str | None = None, without: str = "") -> str:
     """A table of the report of an evaluation, by its title; without: columns, by semicolons."""
     found = [
@@ -65,10 +76,14 @@ def table(name: str, title: str, baseline: str | None = None, without: str = "")
         if table.title == title
     ]
     (one,) = found
-    out = [n for n, head in enumerate(one.header) if head not in without.split("; ")]
-    rows = [[row[n] for n in out] for row in [one.header, *one.rows]]
-    rows.insert(1, [":--"] * one.labels + ["--:"] * (len(out) - one.labels))
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+    return _markdown(one, without.split("; "))
+
+
+def real() -> str:
+    """Medians of real measurements."""
+    found = medians(pd.read_csv(HERE / REAL / "results.csv"))
+    header = [head.replace("-\n", "").replace("\n", " ") for head in found.header]
+    return _markdown(replace(found, header=header), ["ms"])
 
 
 @cache
@@ -144,13 +159,14 @@ def title(name: str, method: str) -> str:
 
 def commit(name: str) -> str:
     """Of the code that made the registrations."""
-    made = {one.get("checkout", "?") for one in evaluation(name).experiment["environments"]}
+    file = HERE / name / (MADE if name == REAL else "experiment.json")
+    made = {one.get("checkout", "?") for one in json.loads(file.read_text())["environments"]}
     return ", ".join(f"`{one[:9]}`" for one in sorted(made))
 
 
 def digest(name: str) -> str:
     """Of the table of an evaluation."""
-    files = sorted((HERE / name).glob("*.parquet"))
+    files = sorted((HERE / name).glob("results.csv" if name == REAL else "*.parquet"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
 
 
@@ -202,6 +218,11 @@ def speeds(problems: Mapping[str, str], columns: Mapping[str, str]) -> str:
 
 def store(folder: Path) -> None:
     """Put the tables of an evaluation here, smaller, and without those of single machines."""
+    if (folder / MADE).exists():
+        (HERE / REAL).mkdir(exist_ok=True)
+        for name in (MADE, "results.csv"):
+            shutil.copyfile(folder / name, HERE / REAL / name)
+        return
     experiment = json.loads((folder / "experiment.json").read_text())
     outside = experiment["outside"]
     experiment["outside"] = {name: Path(path).name for name, path in outside.items()}

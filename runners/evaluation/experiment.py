@@ -176,6 +176,13 @@ def join_experiment(
         beside.write_text(json.dumps(ours, indent=2) + "\n")
 
 
+def this_command() -> str:
+    """The command line of this program."""
+    main = getattr(sys.modules.get("__main__"), "__spec__", None)
+    program = ["python", "-m", main.name] if main else [Path(sys.argv[0]).name]
+    return shlex.join([*program, *sys.argv[1:]])
+
+
 def read_experiment(folder: Path) -> dict[str, Any]:
     """What experiment.json says. Raises RecordingError if it is damaged or missing."""
     path = folder / FILE
@@ -190,12 +197,10 @@ def read_experiment(folder: Path) -> dict[str, Any]:
 def _described(
     plan: Plan, name: str, configurations: Sequence[str], seeds: Sequence[int]
 ) -> dict[str, Any]:
-    main = getattr(sys.modules.get("__main__"), "__spec__", None)
-    program = ["python", "-m", main.name] if main else [Path(sys.argv[0]).name]
     values = {key: value for key, value in asdict(plan).items() if key not in _OF_MACHINE}
     values |= {"methods": values.pop("contenders"), "steered": bool(plan.policies)}
     values |= {"name": name, "configurations": list(configurations), "seeds": list(seeds)}
-    values |= {"commands": [shlex.join([*program, *sys.argv[1:]])], "environments": [environment()]}
+    values |= {"commands": [this_command()], "environments": [environment()]}
     return dict(json.loads(json.dumps(values, default=str)))  # as it will be read
 
 

@@ -1,6 +1,7 @@
 """The command that registers real measurements: on made-up ones, and on some of the real ones."""
 
 import csv
+import json
 
 import numpy as np
 import pytest
@@ -55,6 +56,8 @@ def test_rows_have_errors_to_the_pose_and_residuals_of_the_held_out_half(data, t
         right = float(row["position_error"]) <= 0.005 and float(row["rotation_error"]) < 0.08727
         assert row["right"] == str(right).lower()
         assert row["truth_held"] == ""
+    made = json.loads((tmp_path / "made.json").read_text())
+    assert made["environments"][0]["package numpy"] == np.__version__
     held = [row["held_out"] for row in found if row["points"] == "half"]
     assert held[0] != held[1]  # of other halves
     assert all(0.3 * NOISE < float(value) < 0.02 for value in held)
