@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -464,6 +464,7 @@ class Session:
         self,
         actions: Actions | None = None,
         *,
+        without: Collection[int] = (),
         grasps: tuple[Any, Any] | None = None,
         gripper: Gripper | None = None,
         sure: float = 0.95,
@@ -471,7 +472,8 @@ class Session:
         """Where to touch next, by the policy; None if it stops, and `stop` says why.
 
         actions: that can be taken; by default those of `actions()`. Of the same actions, none is
-        chosen twice. What is added next is taken as the outcome, unless it is a depth image.
+        chosen twice, and none of `without`, indices. What is added next is taken as the outcome,
+        unless it is a depth image.
         grasps: object_from_gripper (G, 4, 4) and widths (G,) of a gripper. Where one of them works
         with a chance of `sure`, `stop` is "grasp", and `grasp` is its world_from_gripper.
         """
@@ -488,6 +490,8 @@ class Session:
             actions = self.actions() if self.steering is None else self.steering.actions
         accepted = "chsel.Actions(world_from_hand, length)"
         require_instance("actions", actions, Actions, accepted)
+        if not set(without) <= set(range(len(actions))):
+            raise SettingError(f"without is {without}; accepted: indices below {len(actions)}")
         if not self._begun:
             raise SettingError("workspace is missing; accepted: workspace=, or points before this")
         if self.steering is None or actions.digest != self.steering.actions.digest:
@@ -498,7 +502,7 @@ class Session:
             self.steering.actions, self._taken = actions, set()
             self._recorder.record(ActionsOffered(self.step, actions, hand))
         available = np.ones(len(actions), dtype=bool)
-        available[list(self._taken)] = False
+        available[[*self._taken, *without]] = False
         decision = self.decide(available).decision
         self.flush()
         self.stop, chosen = decision.stop, decision.chosen

@@ -58,6 +58,8 @@ class WhichObject:
             raise SettingError(f"targets are {shown}; accepted: two or more, of different names")
         self.sessions: dict[str, Session] = {}
         self.candidates: list[Candidate] = []
+        self._offered: Actions | None = None
+        self._taken: set[int] = set()  # of these
         self._noise = SENSOR_NOISE if noise is None else noise
         path = None if record is None else Path(record)
         with ExitStack() as opened:  # if one fails, those before it end
@@ -97,7 +99,15 @@ class WhichObject:
         """Where to touch next, by the likeliest object, see `Session.next_probe`."""
         if not self.candidates:
             raise SettingError("nothing is registered; accepted: `register` before `next_probe`")
-        return self.sessions[self.candidates[0].name].next_probe(actions)
+        session = self.sessions[self.candidates[0].name]
+        offered = self._offered if actions is None else actions
+        offered = session.actions() if offered is None else offered
+        if self._offered is None or offered.digest != self._offered.digest:
+            self._offered, self._taken = offered, set()
+        probe = session.next_probe(offered, without=self._taken)
+        if probe is not None:
+            self._taken.add(probe.action)
+        return probe
 
     def close(self) -> None:
         """End all recordings."""

@@ -189,6 +189,19 @@ def moment(method: str, iteration: int, column: str = "diversity") -> str:
     return number(own[column].median())
 
 
+def moved(name: str, column: str) -> str:
+    """Median in mm, of registrations after eight touches and more of objects that may move."""
+    probes = evaluation(name).probes
+    return number(1000.0 * probes.loc[probes["contacts"] >= 8, column].median())
+
+
+def wrong(name: str) -> str:
+    """Of these, how many that say *determined* are more than 10 mm off."""
+    probes = evaluation(name).probes
+    sure = probes[(probes["contacts"] >= 8) & (probes["verdict"] == "determined")]
+    return f"{(sure['best_error'] > statistics.GOOD).sum()} of {len(sure)}"
+
+
 def solved(name: str, policy: str) -> str:
     """The share of a policy's sessions whose set comes within 10 mm."""
     errors = statistics.steered_sessions(evaluation(name)).errors.loc[policy]

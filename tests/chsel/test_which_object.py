@@ -32,3 +32,22 @@ def test_the_true_object_comes_first(tmp_path):
     with pytest.raises(chsel.ChselError, match=r"again_box\.mcap"):
         chsel.WhichObject(meshes, record=tmp_path / "again.mcap", workspace=WORKSPACE)
     assert read_recording(tmp_path / "again_slim.mcap").ended.outcome.startswith("failed")
+
+
+def test_no_action_is_chosen_by_two_objects():
+    meshes = {"slim": trimesh.creation.box(BOX_SIDES * [1.0, 0.5, 1.0]), "box": BOX}
+    contacts = apply(TRUTH, on_faces(12))
+    finger = trimesh.creation.cylinder(0.01, 0.1)
+    with chsel.WhichObject(meshes, workspace=WORKSPACE, hand=finger) as which:
+        which.add(contacts=contacts[:3])
+        names = [one.name for one in which.register()]
+        every, chosen = which.sessions["box"].actions(), which.next_probe().action
+        one = chsel.Actions(every.world_from_hand[[chosen]], every.length[[chosen]])
+        for contact, name, action in ((3, names[0], 0), (4, names[1], None)):
+            which.add(contacts=contacts[contact : contact + 1])
+            which.candidates = [one for one in which.register() if one.name == name]
+            probe = which.next_probe(one)
+            assert (None if probe is None else probe.action) == action
+        assert which.sessions[names[1]].stop == "actions"
+        with pytest.raises(chsel.ChselError, match=r"without is \[2\]; accepted: indices below 1"):
+            which.sessions[names[0]].next_probe(one, without=[2])
