@@ -170,6 +170,12 @@ def digest(name: str) -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
 
 
+def seeds(name: str) -> str:
+    """Those of an evaluation, as commands have them."""
+    first, *_, last = 2 * evaluation(name).experiment["seeds"]
+    return f"{first}" if first == last else f"{first}..{last}"
+
+
 def definition(name: str) -> str:
     """The plausible sets behind an evaluation's PD, if it has any."""
     every = evaluation(name)
