@@ -195,16 +195,20 @@ def moment(method: str, iteration: int, column: str = "diversity") -> str:
     return number(own[column].median())
 
 
+def pushed(name: str) -> pd.DataFrame:
+    """Registrations after six touches and more of objects that may move: five pushes are known."""
+    probes = evaluation(name).probes.sort_values([*TRIAL, "probes"])
+    return probes[probes.groupby(TRIAL)["hit"].cumsum() >= 6]
+
+
 def moved(name: str, column: str) -> str:
-    """Median in mm, of registrations after eight touches and more of objects that may move."""
-    probes = evaluation(name).probes
-    return number(1000.0 * probes.loc[probes["contacts"] >= 8, column].median())
+    """Median of these, mm."""
+    return number(1000.0 * pushed(name)[column].median())
 
 
 def wrong(name: str) -> str:
-    """Of these, how many that say *determined* are more than 10 mm off."""
-    probes = evaluation(name).probes
-    sure = probes[(probes["contacts"] >= 8) & (probes["verdict"] == "determined")]
+    """How many of these that say *determined* are more than 10 mm off."""
+    sure = pushed(name).query("verdict == 'determined'")
     return f"{(sure['best_error'] > statistics.GOOD).sum()} of {len(sure)}"
 
 
