@@ -1,6 +1,7 @@
 import json
 import os
 import signal
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -140,6 +141,7 @@ def _dies(plan, task):
     mark = plan.folder / "tried"
     if task.label == "always" or (task.label == "once" and not mark.exists()):
         mark.touch()
+        time.sleep(1.0)  # Dask does not replace a worker that dies before it is known to have begun
         os.kill(os.getpid(), signal.SIGKILL)
     tasks.do_task(plan, task)
 
