@@ -21,7 +21,7 @@ from examples.own_robot import FINGER, FakeRobot
 from runners.reporting.tables import Table
 from runners.sessions.probing_settings import ProbingSettings
 from tests.chsel.samples import REPOSITORY
-from tests.runners.made_up_evaluations import row, write_evaluation
+from tests.runners.made_up_evaluations import row, session, write_evaluation, write_sessions
 
 DOCS = REPOSITORY / "docs"
 NEXT_PROBE, PRESETS = ((DOCS / name).read_text() for name in ("next_probe.md", "presets.md"))
@@ -149,6 +149,23 @@ def test_printed_numbers_are_those_of_all_presets():
 
 def test_pages_are_written_from_the_tables_as_they_are():
     assert make.write(checked=True) == []
+
+
+def test_objects_that_moved_are_judged_from_six_touches_on(tmp_path, monkeypatch):
+    hits = [True, True, False, True, True, True, True, True]  # the sixth is the seventh probe
+    columns = {"hit": hits, "best_error": [0.5] * 6 + [0.004, 0.012]}
+    rows = session(
+        "can", 40, "random", [90.0] * 6 + [8.0, 30.0], verdict=["determined"] * 8, **columns
+    )
+    columns["best_error"] = [0.5] * 6 + [0.006, 0.002]
+    rows += session("can", 41, "random", [90.0] * 6 + [2.0, 4.0], verdict=["wide"] * 8, **columns)
+    write_sessions(tmp_path / "made_up", rows, {"random": 8})
+    monkeypatch.setattr(make, "HERE", tmp_path)
+    make.evaluation.cache_clear()
+    found = [make.moved("made_up", column) for column in ("best_error", "error")]
+    shown = [*found, make.wrong("made_up"), make.seeds("made_up")]
+    make.evaluation.cache_clear()
+    assert shown == ["5", "6", "1 of 2", "40..41"]
 
 
 def test_an_entry_is_compared_to_the_bit_and_put_beside_the_others(tmp_path, monkeypatch):

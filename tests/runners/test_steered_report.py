@@ -2,6 +2,7 @@
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet
 import pytest
 
 from runners import report
@@ -155,6 +156,16 @@ def test_tables_have_the_numbers_of_the_sessions(tmp_path, rows):
         ["information", "20", "20", "50", "50", "70", "70"],
         ["grid", "-", "-", "50", "50", "50", "50"],
     ]
+
+
+def test_a_table_of_before_beliefs_were_measured_is_read(tmp_path, rows):
+    folder = write_sessions(tmp_path, rows, BUDGETS)
+    columns = ["middle_50", "middle_90", "grasp_chance", "grasp_works"]
+    table = pyarrow.parquet.read_table(folder / "probes.parquet").drop_columns(columns)
+    pyarrow.parquet.write_table(table, folder / "probes.parquet")
+    tables = tables_of(folder)
+    assert tables["Error of the set after so many probes, mm"][1][0] == "information"
+    assert "Beliefs by the number of contacts" not in tables
 
 
 def test_a_report_is_written_and_a_baseline_without_sessions_is_an_error(tmp_path, rows):
