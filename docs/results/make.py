@@ -82,7 +82,7 @@ def table(name: str, title: str, baseline: str | None = None, without: str = "")
 def real() -> str:
     """Medians of real measurements."""
     found = medians(pd.read_csv(HERE / REAL / "results.csv"))
-    header = [head.replace("-\n", "").replace("\n", " ") for head in found.header]
+    header = tuple(head.replace("-\n", "").replace("\n", " ") for head in found.header)
     return _markdown(replace(found, header=header), ["ms"])
 
 
@@ -170,9 +170,11 @@ def digest(name: str) -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
 
 
-def seeds(name: str) -> str:
-    """Those of an evaluation, as commands have them."""
-    first, *_, last = 2 * evaluation(name).experiment["seeds"]
+def seeds(name: str, method: str | None = None) -> str:
+    """Those of an evaluation, or of a method in it, as commands have them."""
+    every = evaluation(name)
+    used = numbers(name, "seed", method=method).astype(int) if method else every.experiment["seeds"]
+    first, last = min(used), max(used)
     return f"{first}" if first == last else f"{first}..{last}"
 
 
