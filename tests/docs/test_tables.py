@@ -168,6 +168,17 @@ def test_objects_that_moved_are_judged_from_six_touches_on(tmp_path, monkeypatch
     assert shown == ["5", "6", "1 of 2", "40..41"]
 
 
+def test_seeds_of_a_method_are_those_that_it_ran_on(tmp_path, monkeypatch):
+    seeds = {"icp": (3, 5, 4), "cvo": (4,)}
+    rows = [row("can", seed, name, 0) for name, own in seeds.items() for seed in own]
+    write_evaluation(tmp_path / "made_up", rows, methods={"icp": {}, "cvo": {}})
+    monkeypatch.setattr(make, "HERE", tmp_path)
+    make.evaluation.cache_clear()
+    shown = [make.seeds("made_up", name) for name in seeds]
+    make.evaluation.cache_clear()
+    assert shown == ["3..5", "4"]
+
+
 def test_an_entry_is_compared_to_the_bit_and_put_beside_the_others(tmp_path, monkeypatch):
     monkeypatch.setattr(make, "HERE", tmp_path / "kept")
     make.evaluation.cache_clear()
