@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from rich.filesize import decimal
-from rich.progress import BarColumn, TimeElapsedColumn
+from rich.progress import TimeElapsedColumn
 
 from chsel.errors import InputWarning
 from chsel.numerics.compiler import watched
@@ -52,19 +52,6 @@ _COUNTS = {
     "new voxels": "free",
 }
 """Columns of the table of sensors, by their fields of `Counts`."""
-
-
-def counting_bar(console: Console) -> Progress:
-    """A bar for a terminal that shows how much is done, and is gone as soon as it is."""
-    return Progress(
-        TextColumn("  {task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total}"),
-        TimeElapsedColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
 
 
 @contextmanager
