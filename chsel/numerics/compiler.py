@@ -2,7 +2,7 @@
 
 Numba's own cache keeps it, in a folder for each state of the code: a kernel contains what it calls
 and the constants of other files, which numba does not check. So the folder is named by a digest of
-all files of the package: code of changed source never runs.
+all files with kernels and of all that these import: code of changed source never runs.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ KEPT_FOLDERS = 8  # the most recently used, each of a state of the code
 _OTHERS_WRITE = 0o022
 _UNMAPPED = 65534  # owner of what belongs to root outside of a container
 _PACKAGE = Path(__file__).parents[1]
+_IMPORTED = re.compile(r"^ *(?:from|import) (chsel[\w.]*)", re.MULTILINE)
 _config: Any = numba.core.config
 _njit: Any = numba.njit  # its types leave out some options
 _log = logging.getLogger(__name__)
@@ -116,7 +117,7 @@ def implements(name: Callable[..., Any], model: type) -> Callable[[Function], Fu
 
 
 def _states() -> list[tuple[int, int]]:
-    """Time of the last change and size of each file of the package; empty if one is gone."""
+    """Time of the last change and size of each file of the digest; empty if one is gone."""
     try:
         return [(state.st_mtime_ns, state.st_size) for state in map(os.stat, _FILES)]
     except OSError:
@@ -124,7 +125,7 @@ def _states() -> list[tuple[int, int]]:
 
 
 def _digest() -> str:
-    """Of all that machine code depends on, but for the CPU, which numba distinguishes itself."""
+    """Return the digest of what machine code depends on, but for the CPU, which numba checks."""
     versions = numba.__version__, llvmlite.__version__, sys.version
     options = sorted((k, v) for k, v in os.environ.items() if k.startswith("NUMBA_"))
     digest = hashlib.blake2b(repr((versions, options)).encode(), digest_size=10)
@@ -133,13 +134,36 @@ def _digest() -> str:
     return digest.hexdigest()
 
 
-_FILES = sorted(map(str, _PACKAGE.rglob("*.py")))
+def _kernel_files() -> list[str]:
+    """Return the files that import this one, and all files of the package that these import."""
+    files = {_module(file): file for file in _PACKAGE.rglob("*.py")}
+    imported = {
+        module: set(_IMPORTED.findall(file.read_text(encoding="utf-8")))
+        for module, file in files.items()
+    }
+    pending = {module for module, names in imported.items() if __name__ in names}
+    found: set[str] = set()
+    while pending:
+        module = pending.pop()
+        found.add(module)
+        for name in imported[module]:
+            # A folder stands for all of its files.
+            pending |= {other for other in files if f"{other}.".startswith(f"{name}.")} - found
+    return sorted(str(files[module]) for module in found)
+
+
+def _module(file: Path) -> str:
+    """Return the dotted name of a file of the package."""
+    return ".".join(file.relative_to(_PACKAGE.parent).with_suffix("").parts)
+
+
+_FILES = _kernel_files()
 _STATES = _states()  # before they are read
 _STAMP = _digest()
 
 
 def _is_ours(function: Callable[..., Any]) -> bool:
-    """Whether a function is in a file of this package: the digest is of no others."""
+    """Whether a function is in a file that the digest is of."""
     return function.__code__.co_filename in _FILES
 
 

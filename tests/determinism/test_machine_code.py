@@ -1,13 +1,16 @@
 """LLVM may fuse, reorder or replace nothing, whatever the CPU that it makes machine code for."""
 
 import importlib
+import inspect
 import re
 
 import numpy as np
 import pytest
 import trimesh
 from numba.core.registry import CPUDispatcher
+from numba.core.types import BaseTuple, NamedTuple, NamedUniTuple
 
+from chsel.numerics import compiler
 from chsel.plausible.plausible_set import plausible_set
 from chsel.plausible.plausible_settings import PlausibleSettings, PoseGridSettings
 from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance
@@ -94,6 +97,20 @@ def code():
 def test_every_kernel_that_python_calls_is_looked_at(code):
     assert {"chsel.cost.objective.descend", "chsel.qd.emitters.me_iterations"} < set(code)
     assert [name for name, texts in code.items() if not texts] == []
+
+
+def test_tuples_that_kernels_take_are_classes_of_files_that_the_kept_code_depends_on(code):
+    kernels = _from_python().values()
+    types = {each for kernel in kernels for signature in kernel.signatures for each in signature}
+    classes = set()
+    while types:
+        each = types.pop()
+        if isinstance(each, NamedTuple | NamedUniTuple):
+            classes.add(each.instance_class)
+        types |= set(each) if isinstance(each, BaseTuple) else set()
+    files = {inspect.getsourcefile(each) for each in classes}
+    assert len(classes) > 20
+    assert files <= set(compiler._FILES)
 
 
 def test_no_code_may_be_reordered_or_call_what_others_round_otherwise(code):
