@@ -10,6 +10,7 @@ import numpy as np
 
 from chsel.errors import MeshError, MeshWarning, require_positive
 from chsel.numerics.arrays import digest, frozen, refuse_special_file
+from chsel.problem.mesh_parts import outer_surface
 
 if TYPE_CHECKING:
     import trimesh
@@ -85,17 +86,14 @@ def clean_mesh(
     mesh.remove_unreferenced_vertices()
     if len(mesh.faces) == 0:
         raise MeshError(f"{name} has no face with an area; accepted: triangle meshes")
-    if not mesh.is_winding_consistent:
-        trimesh.repair.fix_winding(mesh)
-    if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0.0:
-        mesh.invert()
+    mesh, found = outer_surface(mesh, name)
     if not mesh.is_watertight:
         text = (
-            f"{name} is open even after merging its vertices; the winding number decides what is "
-            "inside, which is inexact near the holes"
+            f"{name} is open even after merging its vertices: the sign near holes is inexact, "
+            "distances are those to the surface"
         )
-        warnings.warn(MeshWarning("open_mesh", text), stacklevel=2)
-    for warning in check_bodies(mesh, name):
+        found.append(MeshWarning("open_mesh", text))
+    for warning in found + check_bodies(mesh, name):
         warnings.warn(warning, stacklevel=2)
     return mesh
 
