@@ -89,9 +89,9 @@ class _Parts:
     def turn_outward(self) -> None:
         """Turn closed parts outward but for cavities, and open parts if they look inward."""
         closed = np.flatnonzero(self._closed)
-        if self._volume[closed].sum() < 0.0:  # the mesh is mirrored
+        before = self._volume[closed]
+        if before.sum() < 0.0:  # probably all are mirrored
             self._turn(closed)
-        turned = []
         for part in closed[np.argsort(-self._diagonal[closed], kind="stable")]:
             if self._volume[part] >= 0.0:
                 continue
@@ -101,11 +101,12 @@ class _Parts:
                 continue
             inside = [other for other in closed if self._contains(part, other)]
             self._turn([part, *inside])  # with its cavities
-            turned.append(int(part))
-        if turned:
+        turned = closed[(before < 0.0) & (self._volume[closed] > 0.0)]
+        if len(turned) > 0 and (np.sign(before) == np.sign(self._volume[closed])).any():
+            largest = int(turned[np.argmax(self._diagonal[turned])])
             count = "a part" if len(turned) == 1 else f"{len(turned)} parts, the largest one"
             text = (
-                f"the faces of {count} of {self._name}, {self._place(turned[0])}, looked inward "
+                f"the faces of {count} of {self._name}, {self._place(largest)}, looked inward "
                 "and were turned outward"
             )
             self.warnings.append(MeshWarning("inward_part", text))
