@@ -97,7 +97,7 @@ class _Parts:
                 continue
             around = [other for other in closed if self._contains(other, part)]
             if np.sign(self._volume[around]).sum() >= 1.0:
-                self._around[int(part)] = [k for k in around if self._volume[k] > 0.0]
+                self._around[int(part)] = [int(k) for k in around if self._volume[k] > 0.0]
                 continue
             inside = [other for other in closed if self._contains(part, other)]
             self._turn([part, *inside])  # with its cavities
@@ -317,7 +317,7 @@ def _split_edges(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     if count.max() <= 2:
         return mesh
     by_edge = np.split(np.argsort(edge.reshape(-1), kind="stable"), np.cumsum(count)[:-1])
-    links = [rows for rows in by_edge if len(rows) == 2]
+    links: list[Any] = [rows for rows in by_edge if len(rows) == 2]
     labels = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
     sheets = DisjointSet(range(int(labels.max()) + 1))
     for rows in by_edge:
