@@ -62,6 +62,7 @@ class _Parts:
         np.maximum.at(self._upper, labels, corners.max(axis=1))
         self._diagonal = np.sqrt(((self._upper - self._lower) ** 2).sum(axis=1))
         self._around: dict[int, list[int]] = {}  # of cavities: the parts around them
+        self._depths: dict[int, FloatArray] = {}  # distances of vertices to parts
         self.warnings: list[MeshWarning] = []
 
         part = labels[mesh.edges_face]
@@ -176,13 +177,23 @@ class _Parts:
             and (self._upper[outer] > self._upper[inner] + _TOUCHING).all()
         ):
             return False
-        solids = [self._part_mesh([part]) for part in (outer, inner)]
-        for part, solid in zip((outer, inner), solids, strict=True):
-            if self._volume[part] < 0.0:
-                solid.invert()
-        deepest = _winding_distance(solids[0], solids[1].vertices)
-        nearest = _winding_distance(solids[1], solids[0].vertices)
-        return bool((deepest < -_TOUCHING).all() and (nearest > _TOUCHING).all())
+        if outer not in self._depths:  # of all vertices, as many small parts may be inside of it
+            self._depths[outer] = _winding_distance(self._outward(outer), self._vertices)
+        if not (self._depths[outer][self._faces[self._rows[inner]]] < -_TOUCHING).all():
+            return False
+        vertices = self._vertices[self._faces[self._rows[outer]].reshape(-1)]
+        lower, upper = self._lower[inner] - _TOUCHING, self._upper[inner] + _TOUCHING
+        near = vertices[((vertices >= lower) & (vertices <= upper)).all(axis=1)]
+        return len(near) == 0 or bool(
+            (_winding_distance(self._outward(inner), near) > _TOUCHING).all()
+        )
+
+    def _outward(self, part: Any) -> trimesh.Trimesh:
+        """A closed part as a mesh that looks outward."""
+        mesh = self._part_mesh([part])
+        if self._volume[part] < 0.0:
+            mesh.invert()
+        return mesh
 
     def _groups(self) -> list[list[int]]:
         """Parts whose boxes overlap or touch."""
