@@ -110,17 +110,25 @@ def _show(shape: tuple[int | None, ...]) -> str:
     return "(" + ", ".join("any" if length is None else str(length) for length in shape) + ")"
 
 
+_LFS = b"version https://git-lfs.github.com/spec/"
 MOST_BYTES = 512 * 2**20  # of the arrays of an .npz file, unpacked: 16 million points with steps
 
 
 def refuse_special_file(name: str, path: Path, error: type[ChselError]) -> None:
-    """Raise `error` if `path` is a FIFO, a socket or a device, or a link to one.
+    """Raise `error` if `path` is a FIFO, a socket or a device, a link to one, or of Git LFS.
 
     name: of the file in the message, such as "recording a.mcap". Other paths pass, also those that
     do not exist or cannot be opened.
     """
     if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
         raise error(f"{name} is a FIFO, a socket or a device; accepted: a file")
+    try:
+        with open(path, "rb") as file:
+            pointer = file.read(len(_LFS)) == _LFS
+    except OSError:
+        return
+    if pointer:
+        raise error(f"{name} is a pointer of Git LFS, not its data; run `git lfs pull` first")
 
 
 def read_npz(

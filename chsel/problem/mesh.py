@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from chsel.errors import MeshError, MeshWarning, require_positive
+from chsel.errors import MeshError, MeshWarning, quoted, require_positive
 from chsel.numerics.arrays import digest, frozen, refuse_special_file
+from chsel.problem.mesh_parts import outer_surface
 
 if TYPE_CHECKING:
     import trimesh
 
 SMALLEST = 0.005  # metres; objects that a gripper probes have a larger extent
 LARGEST = 10.0  # metres; a larger extent is probably in millimetres
+_ACCEPTED = "accepted: a mesh in metres, such as .stl, .obj, .ply, .glb, .dae, .3mf or .off"
 _NEAR = 0.5  # largest gap between the bodies of one object, in diameters of the largest body
 _MOST_BODIES = 1000  # that are compared, the largest ones
 
@@ -23,18 +26,23 @@ _MOST_BODIES = 1000  # that are compared, the largest ones
 def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
     """The checked mesh in a file of any format that trimesh reads; scenes become one mesh.
 
-    scale: metres per unit of the file. Checks and raises as `clean_mesh`, and MeshError if the file
-    does not exist or cannot be read.
+    scale: metres per unit of the file; where the file states its unit (COLLADA, 3MF), of that unit
+    in metres, with a warning if it is another one. Checks and raises as `clean_mesh`, and MeshError
+    if the file does not exist or cannot be read.
     """
     import trimesh
 
     path = Path(path).expanduser()
     refuse_special_file(f"mesh file {path}", path, MeshError)
-    accepted = "a mesh in metres as ." + ", .".join(sorted(trimesh.available_formats()))
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "does not exist"
-        raise MeshError(f"mesh file {path} {what}; accepted: {accepted}")
+        raise MeshError(f"mesh file {path} {what}; {_ACCEPTED}")
     kind = path.suffix.lower().removeprefix(".")
+    if kind not in trimesh.available_formats():
+        advice = "; pip install cascadio reads it" if kind in ("step", "stp") else ""
+        raise MeshError(f"mesh file {path} is of no kind that can be read{advice}; {_ACCEPTED}")
+    if kind == "obj":
+        _refuse_relative_indices(path)
     try:
         loaded = trimesh.load(
             str(path), file_type=kind, force="mesh", process=False, skip_materials=True
@@ -43,21 +51,67 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
         # An ImportError comes from guessing the encoding of a text that is not one.
         damaged = isinstance(error, ImportError)
         reason = "it is damaged" if damaged else " ".join(str(error).split())
+        if "unexpected length" in reason:
+            reason = "it is cut short, or not all faces are triangles: export it with triangles"
         raise MeshError(
-            f"mesh file {path} cannot be read as .{kind}: {reason}; accepted: {accepted}"
+            f"mesh file {path} cannot be read as .{kind}: {reason}; {_ACCEPTED}"
         ) from error
     if not isinstance(loaded, trimesh.Trimesh):
         raise MeshError(f"mesh file {path} has no faces; accepted: triangle meshes")
-    return clean_mesh(loaded.vertices, loaded.faces, name=f"mesh file {path}", scale=scale)
+    name = f"mesh file {path}"
+    # Old versions of trimesh lose the unit of this format where they join its parts.
+    units = loaded.units if kind != "3mf" else trimesh.load(str(path), process=False).units
+    metres = _metres_of(units, name)
+    if metres != 1.0:
+        text = f"{name} states its unit, {metres:.6g} m, which scale multiplies"
+        warnings.warn(MeshWarning("mesh_unit", text), stacklevel=2)
+        name += f" (unit {metres:.6g} m, times scale)"
+    hint = "pass chsel.load_mesh(path, scale=0.001), to commands object.scale=0.001"
+    return clean_mesh(
+        loaded.vertices, loaded.faces, name=name, scale=scale, metres=metres, hint=hint
+    )
+
+
+def _metres_of(unit: str | None, name: str) -> float:
+    """Metres of the unit that a file states; 1 if it states none."""
+    import trimesh
+
+    if unit is None:
+        return 1.0
+    try:
+        metres = float(trimesh.units.unit_conversion(unit, "meters"))
+    except (ValueError, KeyError):
+        metres = 0.0
+    if not 0.0 < metres < np.inf:
+        raise MeshError(f"{name} states the unit {quoted(unit)}; accepted: a length, such as inch")
+    return 1.0 if abs(metres - 1.0) < 1e-9 else metres
+
+
+def _refuse_relative_indices(path: Path) -> None:
+    """Raise MeshError for an OBJ file whose relative indices trimesh takes as from its end."""
+    text = path.read_bytes()
+    relative = re.search(rb"^[ \t]*f[ \t][^\n]*-\d", text, re.MULTILINE)
+    if relative and re.search(rb"^[ \t]*v[ \t]", text[relative.start() :], re.MULTILINE):
+        raise MeshError(
+            f"mesh file {path} counts vertices back from faces (f -4 -3 -2) in several groups; "
+            "accepted: indices that count from the first vertex of the file"
+        )
 
 
 def clean_mesh(
-    vertices: Any, faces: Any, *, name: str = "mesh", scale: float = 1.0
+    vertices: Any,
+    faces: Any,
+    *,
+    name: str = "mesh",
+    scale: float = 1.0,
+    metres: float = 1.0,
+    hint: str = "multiply its vertices by 0.001",
 ) -> trimesh.Trimesh:
     """A checked mesh in metres: equal vertices merged, faces turned outward, float64.
 
-    vertices (V, 3): in units of `scale` metres. faces (F, 3): indices of vertices. Warns about
-    meshes that are open after merging, or have bodies far apart.
+    vertices (V, 3): in units of `scale` times `metres`. faces (F, 3): indices of vertices. hint:
+    what to do about millimetres. Overlapping parts are united, see `outer_surface`. Warns about
+    meshes that are open after merging, have parts that looked inward, or bodies far apart.
     Raises MeshError if there are no faces, a number is not finite, an index has no vertex, the mesh
     is flat, or its size in metres is not that of an object.
     """
@@ -75,7 +129,8 @@ def clean_mesh(
             f"{name}: faces[{row}] is {faces[row].tolist()}; "
             f"accepted: indices of its {len(vertices)} vertices"
         )
-    _check_size(name, np.ptp(vertices[np.unique(faces)], axis=0) * scale)
+    scale *= metres
+    _check_size(name, np.ptp(vertices[np.unique(faces)], axis=0) * scale, hint)
 
     # Without textures and normals, whose seams would keep vertices apart.
     mesh = trimesh.Trimesh(vertices * scale, faces, process=False)
@@ -85,17 +140,14 @@ def clean_mesh(
     mesh.remove_unreferenced_vertices()
     if len(mesh.faces) == 0:
         raise MeshError(f"{name} has no face with an area; accepted: triangle meshes")
-    if not mesh.is_winding_consistent:
-        trimesh.repair.fix_winding(mesh)
-    if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0.0:
-        mesh.invert()
+    mesh, found = outer_surface(mesh, name)
     if not mesh.is_watertight:
         text = (
-            f"{name} is open even after merging its vertices; the winding number decides what is "
-            "inside, which is inexact near the holes"
+            f"{name} is open even after merging its vertices: the sign near holes is inexact, "
+            "distances are those to the surface"
         )
-        warnings.warn(MeshWarning("open_mesh", text), stacklevel=2)
-    for warning in check_bodies(mesh, name):
+        found.append(MeshWarning("open_mesh", text))
+    for warning in found + check_bodies(mesh, name):
         warnings.warn(warning, stacklevel=2)
     return mesh
 
@@ -133,17 +185,17 @@ def check_bodies(mesh: trimesh.Trimesh, name: str) -> list[MeshWarning]:
     return [MeshWarning("bodies_apart", text)]
 
 
-def _check_size(name: str, extents: np.ndarray) -> None:
+def _check_size(name: str, extents: np.ndarray, hint: str) -> None:
     """Raise MeshError unless extents (3,), in metres, are those of a solid of plausible size."""
     largest = float(extents.max())
     size = " x ".join(f"{extent:.4g}" for extent in extents) + " m"
     accepted = f"accepted: a largest extent of {SMALLEST} m to {LARGEST:g} m"
     if largest > LARGEST:
         raise MeshError(
-            f"{name} is {size}; looks like millimetres; pass scale=0.001, to commands "
-            f"object.scale=0.001 ({accepted} after scaling)"
+            f"{name} is {size}; if it is in millimetres, {hint} ({accepted} after scaling)"
         )
     if float(extents.min()) == 0.0:
         raise MeshError(f"{name} is {size}: flat; accepted: a solid, with three extents above 0")
     if largest < SMALLEST:
-        raise MeshError(f"{name} is {size}: too small; pass a larger scale ({accepted})")
+        larger = hint.replace("0.001", "S")
+        raise MeshError(f"{name} is {size}: too small; {larger}, with a larger S ({accepted})")

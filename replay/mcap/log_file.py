@@ -13,6 +13,7 @@ from mcap.records import Chunk, ChunkIndex, DataEnd, McapRecord, Message
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import SessionError
+from chsel.numerics.arrays import refuse_special_file
 from replay.mcap.file import MALFORMED, chunk_at, file_records, file_summary, reason_of, unpacked
 from replay.mcap.texts import one_line
 
@@ -62,6 +63,7 @@ class RawFile:
         self.times: tuple[int, int] | None = None
         self._schemas: dict[int, records.Schema] = {}
         self._chunks: list[ChunkIndex] = []
+        refuse_special_file(f"log {path}", path, SessionError)
         try:
             with path.open("rb") as file:
                 start = file.read(len(MCAP0_MAGIC))

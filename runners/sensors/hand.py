@@ -11,7 +11,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from chsel.errors import SettingError
-from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.arrays import FloatArray, IntArray, refuse_special_file
+from chsel.problem.mesh_parts import outer_surface
 from chsel.problem.points import Lattice
 from chsel.problem.poses import compose, roll_pitch_yaw
 from chsel.sensing.free_space import interior_lattice, poses_between
@@ -95,7 +96,10 @@ class HandModel:
         """A closed solid, turned outward: a mesh, or its convex hull if it is open."""
         import trimesh
 
-        solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
+        if mesh.units not in (None, "meters"):
+            self.warnings.append(f"{name} states its unit ({mesh.units}), but is taken in metres")
+        solid, found = outer_surface(trimesh.Trimesh(mesh.vertices, mesh.faces), name)
+        self.warnings += [str(warning) for warning in found]
         if not (solid.is_watertight and solid.is_winding_consistent and solid.volume != 0.0):
             self.warnings.append(f"{name} is open; its convex hull is used")
             solid = solid.convex_hull
@@ -123,6 +127,7 @@ def _robot(path: Path, where: str) -> Any:
             f"{where} needs the package yourdfpy; install it where the project is: "
             "pip install -e '.[sensors]'"
         ) from None
+    refuse_special_file(where, path, SettingError)
     content = path.read_bytes()
     if b"<xacro:" in content:
         raise SettingError(f"{where} holds xacro macros; accepted: what the tool xacro makes")
@@ -161,6 +166,7 @@ def _mesh_file(fname: str, folder: Path) -> str:
     for parent in (folder, *folder.parents):
         for path in (parent / name, parent / name.partition("/")[2]):
             if path.is_file():
+                refuse_special_file(f"mesh {path}", path, SettingError)
                 return str(path)
     raise FileNotFoundError(f"mesh {fname} does not exist in or above {folder}")
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from chsel.errors import ChselError, PointsError, PoseError, SettingError, require_positive
 from chsel.events import Probe
-from chsel.numerics.arrays import FloatArray, IntArray, frozen, read_npz
+from chsel.numerics.arrays import FloatArray, IntArray, frozen, read_npz, refuse_special_file
 from chsel.problem.points import (
     FREE_RESOLUTION,
     KnownPoints,
@@ -122,6 +122,7 @@ def read_points(path: str | Path) -> PointFile:
         )
     if not path.is_file():
         raise PointsError(f"point file {path} does not exist; accepted: a file")
+    refuse_special_file(f"point file {path}", path, PointsError)
     try:
         content = reader(path)
         if len(content.points) == 0:

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from chsel.errors import SessionError
+from chsel.numerics.arrays import refuse_special_file
 from runners.sensors.log.messages import UnusableMessage
 
 _KINDS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
@@ -77,6 +78,7 @@ def read_image(path: Path, where: str) -> np.ndarray:
     a file that is missing, broken, or of several channels.
     """
     kind = path.suffix.lower()
+    refuse_special_file(f"{where} {path}", path, SessionError)
     try:
         if kind == ".npy":
             values = np.load(path, allow_pickle=False)

@@ -1,4 +1,5 @@
 import warnings
+import zipfile
 
 import numpy as np
 import pytest
@@ -44,8 +45,8 @@ def test_a_scene_becomes_one_mesh_with_its_parts_in_place(tmp_path):
 def test_bodies_far_apart_are_counted_and_parts_near_one_another_one_object_however_many():
     """A row of parts is longer than what is far apart, and no two neighbours are."""
     two = trimesh.util.concatenate([BOX, moved(BOX, 0.05, 0.0, 0.0), moved(BOX, 0.0, 1.0, 0.0)])
-    with pytest.warns(MeshWarning, match=r"shelf has 2 bodies at least 0\.8 m apart, .* 0\.374 m"):
-        assert len(clean_mesh(two.vertices, two.faces, name="shelf").faces) == 36
+    with pytest.warns(MeshWarning, match=r"shelf has 2 bodies at least 0\.8 m apart, .* 0\.391 m"):
+        assert clean_mesh(two.vertices, two.faces, name="shelf").volume == pytest.approx(0.015)
     row = [moved(BOX, 0.25 * k, 0.0, 0.0) for k in range(8)]
     crumb = moved(trimesh.creation.box((0.001, 0.001, 0.001)), 0.0, 0.25, 0.0)
     parts = trimesh.util.concatenate([*row, crumb])
@@ -83,7 +84,7 @@ def test_faces_are_turned_outward_and_those_that_merging_collapses_dropped(flipp
 
 def test_an_open_mesh_is_kept_with_a_warning_that_names_it(tmp_path):
     trimesh.Trimesh(BOX.vertices, BOX.faces[1:]).export(tmp_path / "open.off")
-    with pytest.warns(UserWarning, match=r"open\.off is open .* winding number"):
+    with pytest.warns(UserWarning, match=r"open\.off is open .* the sign near holes is inexact"):
         mesh = load_mesh(tmp_path / "open.off")
     assert len(mesh.faces) == 11
 
@@ -92,7 +93,7 @@ def test_files_that_are_no_mesh_are_named(tmp_path):
     trimesh.PointCloud(np.eye(3)).export(tmp_path / "cloud.ply")
     (tmp_path / "noise.obj").write_bytes(np.random.default_rng(0).bytes(1000))
     for name, message in (
-        ("nowhere.obj", r"does not exist; accepted: .*\.obj.*\.stl"),
+        ("nowhere.obj", r"does not exist; accepted: a mesh in metres, such as \.stl, \.obj"),
         ("", "is a folder"),
         ("noise.obj", "(cannot be read|has no faces)"),
         ("cloud.ply", "has no faces"),
@@ -127,8 +128,123 @@ def test_sizes_up_to_the_bounds_are_accepted_and_millimetres_suspected():
         with pytest.raises(MeshError, match=r"largest extent of 0\.005 m to 10 m"):
             clean_mesh(BOX.vertices, BOX.faces, scale=refused / 0.3)
     thousandfold = BOX.vertices * 1000
-    with pytest.raises(MeshError, match=r"100 x 200 x 300 m; looks like millimetres.*scale=0\.001"):
+    with pytest.raises(MeshError, match=r"100 x 200 x 300 m; if .* millimetres, multiply its vert"):
         clean_mesh(thousandfold, BOX.faces)
     assert clean_mesh(thousandfold, BOX.faces, scale=0.001).extents == pytest.approx(EXTENTS)
     with pytest.raises(SettingError, match="mesh scale"):
         clean_mesh(BOX.vertices, BOX.faces, scale=0.0)
+
+
+def test_for_millimetres_in_a_file_the_error_says_what_to_write(tmp_path):
+    trimesh.Trimesh(BOX.vertices * 1000, BOX.faces).export(tmp_path / "part.stl")
+    with pytest.raises(MeshError, match=r"chsel\.load_mesh\(path, scale=0\.001\), to commands obj"):
+        load_mesh(tmp_path / "part.stl")
+    assert load_mesh(tmp_path / "part.stl", scale=0.001).extents == pytest.approx(EXTENTS)
+
+
+def collada(path, unit, vertices, faces):
+    numbers = " ".join(str(x) for x in np.ravel(vertices))
+    path.write_text(
+        '<?xml version="1.0"?><COLLADA version="1.4.1" '
+        'xmlns="http://www.collada.org/2005/11/COLLADASchema"><asset>'
+        "<created>2020-01-01T00:00:00</created><modified>2020-01-01T00:00:00</modified>"
+        f'{unit}<up_axis>Z_UP</up_axis></asset><library_geometries><geometry id="g"><mesh>'
+        f'<source id="p"><float_array id="pa" count="{3 * len(vertices)}">{numbers}</float_array>'
+        f'<technique_common><accessor source="#pa" count="{len(vertices)}" stride="3">'
+        + "".join(f'<param name="{axis}" type="float"/>' for axis in "XYZ")
+        + '</accessor></technique_common></source><vertices id="v"><input semantic="POSITION" '
+        f'source="#p"/></vertices><triangles count="{len(faces)}"><input semantic="VERTEX" '
+        f'source="#v" offset="0"/><p>{" ".join(str(i) for i in np.ravel(faces))}</p></triangles>'
+        '</mesh></geometry></library_geometries><library_visual_scenes><visual_scene id="s">'
+        '<node id="n"><instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>'
+        '<scene><instance_visual_scene url="#s"/></scene></COLLADA>'
+    )
+
+
+def three_mf(path, unit, vertices, faces):
+    """A model of two components, 4 units apart along x."""
+    corners = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in vertices)
+    triangles = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in faces)
+    model = (
+        f'<?xml version="1.0"?><model{unit} '
+        'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"><resources>'
+        f'<object id="1" type="model"><mesh><vertices>{corners}</vertices><triangles>{triangles}'
+        '</triangles></mesh></object><object id="2" type="model"><components>'
+        '<component objectid="1"/><component objectid="1" transform="1 0 0 0 1 0 0 0 1 4 0 0"/>'
+        '</components></object></resources><build><item objectid="2"/></build></model>'
+    )
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("3D/3dmodel.model", model)
+
+
+@pytest.mark.parametrize(
+    ("file_name", "unit", "metres", "length"),
+    [
+        ("inch.dae", '<unit meter="0.0254" name="inch"/>', 0.0254, 3),
+        ("centimetres.dae", '<unit meter="0.01" name="centimeter"/>', 0.01, 3),
+        ("metres.dae", '<unit meter="1" name="meter"/>', 1.0, 3),
+        ("none.dae", "", 1.0, 3),
+        ("inch.3mf", ' unit="inch"', 0.0254, 5),
+        ("default.3mf", "", 0.001, 5),
+    ],
+)
+def test_the_unit_that_a_file_states_counts_and_scale_multiplies_it(
+    tmp_path, file_name, unit, metres, length
+):
+    write = collada if file_name.endswith("dae") else three_mf
+    write(tmp_path / file_name, unit, BOX.vertices * 10.0, BOX.faces)  # 1 x 2 x 3 units
+    for scale in (1.5, 2.0):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            mesh = load_mesh(tmp_path / file_name, scale=scale)
+        assert mesh.extents.max() == pytest.approx(length * metres * scale)
+        units = [str(w.message) for w in caught if w.message.code == "mesh_unit"]
+        assert len(units) == (metres != 1.0)
+        assert all(f"states its unit, {metres:.6g} m" in text for text in units)
+
+
+def test_an_error_about_the_size_names_the_unit_of_the_file(tmp_path):
+    collada(tmp_path / "a.dae", '<unit meter="0.0254"/>', BOX.vertices * 2000.0, BOX.faces)
+    with (
+        pytest.warns(MeshWarning, match=r"states its unit, 0\.0254 m, which scale multiplies"),
+        pytest.raises(MeshError, match=r"a\.dae \(unit 0\.0254 m, times scale\) is 5\.08 x"),
+    ):
+        load_mesh(tmp_path / "a.dae")
+
+
+def test_relative_indices_are_read_right_or_refused(tmp_path):
+    """trimesh counts them from the end of the file, so the last of two objects would come twice."""
+    body = [f"v {x} {y} {z}" for x, y, z in CORNERS]
+    faces = ["f " + " ".join(str(c - 4) for c in face) for face in TETRAHEDRON]
+    (tmp_path / "one.obj").write_text("\n".join(body + faces))
+    assert load_mesh(tmp_path / "one.obj").volume == pytest.approx(1 / 6)
+    (tmp_path / "two.obj").write_text("\n".join([*body, *faces, "o b", *body, *faces]))
+    with pytest.raises(MeshError, match=r"two\.obj counts vertices back from faces"):
+        load_mesh(tmp_path / "two.obj")
+
+
+LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 12\n"
+MIXED_PLY = (
+    b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\nproperty float y\n"
+    b"property float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    + np.arange(15, dtype="<f4").tobytes()
+    + b"\x03"
+    + np.array([0, 1, 2], dtype="<i4").tobytes()
+    + b"\x04"
+    + np.array([0, 1, 3, 4], dtype="<i4").tobytes()
+)
+
+
+@pytest.mark.parametrize(
+    ("file_name", "content", "message"),
+    [
+        ("a.step", b"ISO-10303-21;", r"of no kind .* cascadio .*such as \.stl, \.obj"),
+        ("a.slt", b"solid", r"of no kind that can be read; accepted: a mesh in metres"),
+        ("a.stl", LFS_POINTER, r"a pointer of Git LFS, not its data; run `git lfs pull`"),
+        ("a.ply", MIXED_PLY, r"not all faces are triangles: export it with triangles"),
+    ],
+)
+def test_files_that_cannot_be_read_say_what_to_do(tmp_path, file_name, content, message):
+    (tmp_path / file_name).write_bytes(content)
+    with pytest.raises(MeshError, match=f"{file_name} .*{message}"):
+        load_mesh(tmp_path / file_name)
