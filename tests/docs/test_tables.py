@@ -41,6 +41,31 @@ def test_files_and_classes_that_the_page_of_the_architecture_names_exist():
     assert {word for word in classes if not re.search(rf"\b{word}\b", text)} == set()
 
 
+PAGES = [REPOSITORY / name for name in ("README.md", "CONTRIBUTING.md")]
+PAGES += sorted(DOCS.glob("*.md"))
+LINK = re.compile(r"\]\((?!https?:)(?P<path>[^)#\s]*)(?:#(?P<section>[^)\s]+))?\)")
+
+
+def sections(page):
+    """The names by which links name the sections of a page, as GitHub makes them."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.M | re.S)
+    titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_and_named_sections_exist(page):
+    text, dead = page.read_text(), []
+    for link in LINK.finditer(text):
+        to = (page.parent / link["path"]).resolve() if link["path"] else page
+        if not to.exists() or (link["section"] and link["section"] not in sections(to)):
+            dead.append(link[0])
+    for name, title in re.findall(r'(README|CONTRIBUTING|\w+\.md), "([^"]+)"', text):
+        to = next(page for page in PAGES if page.name == f"{name.removesuffix('.md')}.md")
+        dead += [title] if title.lower().replace(" ", "-") not in sections(to) else []
+    assert dead == []
+
+
 def cells(title):
     """The rows of the tables of a section of next_probe.md, by their first cell, a name."""
     section = re.split(rf"^## {title}\n", NEXT_PROBE, flags=re.MULTILINE)[1].partition("\n## ")[0]
