@@ -64,7 +64,7 @@ from chsel.problem.points import (
 )
 from chsel.problem.poses import nearest_rigid
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
-from chsel.problem.sdf_grid import object_grid
+from chsel.problem.sdf_grid import OBJECT_PADDING, object_grid
 from chsel.problem.streams import StreamKey
 from chsel.problem.trust import check_trust
 from chsel.registration import Registered, one_line, register_recorded
@@ -168,9 +168,13 @@ class Session:
             grid = FreeGrid(workspace, free_resolution)
         sdf = object_grid(mesh, resolution)
         recorder, environment = _recorder(record, live)
+        grid_settings = {  # by which a damaged grid can be made again
+            "object_resolution": None if resolution is None else float(resolution),
+            "object_padding": OBJECT_PADDING,
+        }
         config = {
             "object": {"name": name},
-            "session": {"kind": "live"} | ({"moves": moves} if moves else {}),
+            "session": {"kind": "live", **grid_settings} | ({"moves": moves} if moves else {}),
             "method": {"name": method_name, **_plain(method.settings)},
             "policy": {"name": policy_name, **_plain(policy.settings)},
             "preset": {"name": preset},

@@ -5,18 +5,22 @@ from __future__ import annotations
 import sys
 import unicodedata
 from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
 import rich.console
 import rich.progress
 from rich.box import SIMPLE_HEAD
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
 # Control and format characters (such as those that reverse the direction of what follows), halves
 # of surrogate pairs (bytes of file names that are not UTF-8), ends of lines and paragraphs.
 _NOT_SHOWN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+_MOST_LABELS = 0.6  # of the width of a terminal: texts that stand beside each part of a table
 
 
 def printable(text: str, *, keep: str = "") -> str:
@@ -75,9 +79,40 @@ class Console(rich.console.Console):
         )
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print texts and tables; a newline within a text is shown, not sent."""
-        shown = (printable(text) if isinstance(text, str) else text for text in objects)
+        """Print texts and tables; a newline within a text is shown, not sent.
+
+        A table that is wider than the terminal is printed as several, of some of its columns each.
+        """
+        shown: list[Any] = []
+        for one in objects:
+            if isinstance(one, Table):
+                shown += self._blocks(one)
+            else:
+                shown.append(printable(one) if isinstance(one, str) else one)
         super().print(*shown, **options)
+
+    def _blocks(self, table: Table) -> list[Table]:
+        """The table; if it is too wide, tables that fit and all begin with its columns of texts."""
+        columns = range(len(table.columns))
+        numbers = [n for n in columns if table.columns[n].overflow != "fold"]
+        labels = range(max(1, numbers[0])) if numbers else columns
+        longest = _MOST_LABELS * self.width  # longer ones are folded where they stand
+        if self._width_of(table) <= self.width or self._width_of(_part(table, labels)) > longest:
+            return [table]
+        blocks: list[list[int]] = []
+        for n in range(len(labels), len(table.columns)):
+            last = blocks[-1] if blocks else None
+            if last and self._width_of(_part(table, [*last, n])) <= self.width:
+                last.append(n)
+            else:
+                blocks.append([*labels, n])
+        first, *others = (_part(table, block) for block in blocks)
+        for other in others:
+            other.title = None
+        return [first, *others]
+
+    def _width_of(self, table: Table) -> int:
+        return Measurement.get(self, self.options.update(width=10_000), table).maximum
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Every text comes through here: what is printed, and each cell and title of a table."""
@@ -103,6 +138,13 @@ def plain_table(
     for name in numbers:
         table.add_column(name, justify="right", no_wrap=True)
     return table
+
+
+def _part(table: Table, columns: Sequence[int]) -> Table:
+    """A table of some of the columns of another one."""
+    part = copy(table)
+    part.columns = [replace(table.columns[n], _index=i) for i, n in enumerate(columns)]
+    return part
 
 
 class Progress(rich.progress.Progress):

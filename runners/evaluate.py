@@ -18,7 +18,7 @@ from chsel.numerics.threads import require_threads
 from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.problem.settings import CheckedSettings, build_settings, one_of
 from replay.console import Console, Progress
-from runners.command.program import command, plain
+from runners.command.program import command, plain, require_used
 from runners.evaluation.contenders import chosen_contenders, chosen_policies, require_label
 from runners.evaluation.experiment import collect, join_experiment, writing_alone
 from runners.evaluation.metrics import MetricsConfig
@@ -81,7 +81,13 @@ class EvaluateConfig(CheckedSettings):
 def main(config: DictConfig) -> None:
     """Do what is not done yet, and collect all that is there."""
     checked = build_settings(EvaluateConfig, plain(config), "evaluate")
+    if checked.policies is None:
+        accepted = "policies=all, or a list of policies, with it"
+        require_used("policy", reason="policies is null", accepted=accepted)
     plan, console = _plan(checked), Console(soft_wrap=True)
+    if plan.kind != SENSORS:
+        reason = f"true poses are sought in logs, and the session is {plan.kind}"
+        require_used("truth", reason=reason, accepted=f"session={SENSORS} with it")
     levels = chosen_names("faults", checked.faults, [CLEAN] if plan.kind == SENSORS else LEVELS)
     clean = {name: one.object for name, one in plan.configurations.items() if one.faults == CLEAN}
     chosen = chosen_names("configurations", checked.configurations, clean, clean)

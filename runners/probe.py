@@ -29,11 +29,11 @@ from replay.console import Console
 from replay.files import WritingError, file_digest
 from replay.recorder import open_recorder
 from runners.command.choices import calls_for_anchored
-from runners.command.program import command, plain
+from runners.command.program import command, plain, require_used
 from runners.run.display import Display, compiling_line
 from runners.run.grasps import Grasps
 from runners.run.recording import make_run_folder, write_in_run_folder
-from runners.run.scene import ProbeConfig, Scene, open_scene, session_started
+from runners.run.scene import GRID, PROBED_BY_US, ProbeConfig, Scene, open_scene, session_started
 from runners.run.session_run import Row, steps
 
 
@@ -42,6 +42,7 @@ def main(config: DictConfig) -> None:
     """Run one session."""
     values = plain(config)
     checked = build_settings(ProbeConfig, values, "probe")
+    _require_used_settings(checked)
     method_config, kind = dict(checked.method), checked.session.get("kind")
     method_name = str(method_config.pop("name", None))
     title = f"{kind} session, {method_name}, preset {checked.preset.name}, seed {checked.seed}"
@@ -70,6 +71,31 @@ def main(config: DictConfig) -> None:
             interrupted = run(folder, checked, method, scene, started, grasps, interrupt, display)
     if interrupted:
         sys.exit(130)
+
+
+def _require_used_settings(config: ProbeConfig) -> None:
+    """Raise SettingError for a setting that would change nothing, as another choice is made."""
+    kind, recording = config.session.get("kind"), config.recording
+    if config.policy.get("name") == GRID:
+        reason = "without policy=NAME, or with grid, a session probes in its own order"
+        require_used("policy.", reason=reason, accepted="policy=expected_loss, or another, with it")
+    else:
+        starts = (f"session.{name}" for name in ("start_contacts", "start_probe"))
+        reason = "a session with a policy registers from its first contact on"
+        require_used(*starts, reason=reason, accepted="policy=grid with it")
+    if kind == "recorded":
+        reason, accepted = "a recorded session brings its own object", "another session with it"
+        require_used("object", "configuration", reason=reason, accepted=accepted)
+    elif kind not in PROBED_BY_US:
+        accepted = "session=simulated or kinematic with it"
+        reason = f"a session of kind {kind} has its own place of the object"
+        require_used("configuration", "object.configuration", reason=reason, accepted=accepted)
+    if config.grasp.path is None:
+        require_used("grasp", reason="grasp.path is not given", accepted="grasp.path=FILE with it")
+    if not (recording.mcap or recording.rerun or recording.live):
+        reason, accepted = "nothing is recorded", "recording=both, mcap or rerun with it"
+        unused = (f"recording.{name}" for name in ("snapshot_interval", "timings"))
+        require_used(*unused, reason=reason, accepted=accepted)
 
 
 def _default_because() -> str:

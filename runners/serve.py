@@ -21,7 +21,7 @@ from replay.console import Console
 from runners.command.program import command, plain
 from runners.run.display import compiling_line
 from runners.serving.messages import OpenRequest
-from runners.serving.server import Server
+from runners.serving.server import PATIENCE, Server
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,11 @@ def main(config: DictConfig) -> None:
         console.print(f"serving at http://{host}:{port}, recordings in {folder}/, until Ctrl-C")
         console.print(f"token: {token}" if not given else "token: that of CHSEL_TOKEN")
         web.run_app(
-            Server(token, folder).app, sock=listening, print=lambda *_: None, access_log=None
+            Server(token, folder).app,
+            sock=listening,
+            print=lambda *_: None,
+            access_log=None,
+            shutdown_timeout=PATIENCE,
         )
 
 

@@ -1,8 +1,7 @@
 """`python -m docs.results.make`: docs/results.md, docs/benchmark.md and the README's numbers.
 
-python -m docs.results.make                   write the pages from the tables in this folder
-python -m docs.results.make store FOLDER ...  put evaluations here first, under their names
-python -m docs.results.make rank FOLDER       show an evaluation of your own beside that here
+python -m docs.results.make                   write the pages from the tables in runners/results
+python -m docs.results.make store FOLDER ...  put evaluations there first, under their names
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -22,41 +21,31 @@ import jinja2
 import pandas as pd
 import pyarrow.parquet
 
-from replay.console import Console
 from runners.evaluation.experiment import TABLES
 from runners.real import MADE, medians
 from runners.reporting import sections, statistics
 from runners.reporting.evaluation_folder import TRIAL, Evaluation, open_evaluation
 from runners.reporting.figures import styles_of
-from runners.reporting.tables import (
-    Table,
-    number,
-    percent,
-    percent_range,
-    print_table,
-    with_range,
-)
+from runners.reporting.ranking import KEPT, stored_names
+from runners.reporting.tables import Table, number, percent, percent_range, with_range
 from runners.sessions.faults import LEVELS
 
 HERE, DOCS = Path(__file__).parent, Path(__file__).parents[1]
 PAGES = {HERE / f"{name}.md.j2": DOCS / f"{name}.md" for name in ("results", "benchmark")}
 README = DOCS.parent / "README.md"
 _BLOCK = re.compile(r"(<!-- ([a-z_]+) of docs/results -->\n).*?(<!-- end -->)", re.DOTALL)
-_KEYS = [*TRIAL, "faults", "step", "method", "policy", "draw"]
-_TIMES = ["seconds", "decision_seconds"]
 REAL = "real"  # results of runners.real
-PACKAGE = "package"  # with which methods are compared
 
 
 @cache
 def evaluation(name: str) -> Evaluation:
     """The one that is kept under this name."""
-    return open_evaluation(HERE / name)
+    return open_evaluation(KEPT / name)
 
 
 def stored() -> list[str]:
-    """Names of all evaluations here."""
-    return sorted(path.parent.name for path in HERE.glob("*/experiment.json"))
+    """Names of all evaluations that are kept."""
+    return stored_names(KEPT)
 
 
 def _markdown(table: Table, without: Sequence[str] = ()) -> str:
@@ -159,14 +148,15 @@ def title(name: str, method: str) -> str:
 
 def commit(name: str) -> str:
     """Of the code that made the registrations."""
-    file = HERE / name / (MADE if name == REAL else "experiment.json")
+    file = HERE / REAL / MADE if name == REAL else KEPT / name / "experiment.json"
     made = {one.get("checkout", "?") for one in json.loads(file.read_text())["environments"]}
     return ", ".join(f"`{one[:9]}`" for one in sorted(made))
 
 
 def digest(name: str) -> str:
     """Of the table of an evaluation."""
-    files = sorted((HERE / name).glob("results.csv" if name == REAL else "*.parquet"))
+    kept = sorted((KEPT / name).glob("*.parquet"))
+    files = [HERE / REAL / "results.csv"] if name == REAL else kept
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
 
 
@@ -242,7 +232,7 @@ def speeds(problems: Mapping[str, str], columns: Mapping[str, str]) -> str:
 
 
 def store(folder: Path) -> None:
-    """Put the tables of an evaluation here, smaller, and without those of single machines."""
+    """Keep the tables of an evaluation, smaller, and without those of single machines."""
     if (folder / MADE).exists():
         (HERE / REAL).mkdir(exist_ok=True)
         for name in (MADE, "results.csv"):
@@ -251,36 +241,13 @@ def store(folder: Path) -> None:
     experiment = json.loads((folder / "experiment.json").read_text())
     outside = experiment["outside"]
     experiment["outside"] = {name: Path(path).name for name, path in outside.items()}
-    to = HERE / experiment["name"]
+    to = KEPT / experiment["name"]
     to.mkdir(exist_ok=True)
     (to / "experiment.json").write_text(json.dumps(experiment, indent=1) + "\n")
     for name in TABLES:
         if (folder / f"{name}.parquet").exists():
             table = pyarrow.parquet.read_table(folder / f"{name}.parquet")
             pyarrow.parquet.write_table(table, to / f"{name}.parquet", compression="zstd")
-
-
-def rank(folder: Path) -> Iterator[str | Table]:
-    """Whether an evaluation has the bits of the one here where both have rows, and its place."""
-    own = open_evaluation(folder)
-    ours = evaluation(own.experiment["name"])
-    kind, group = ("probes", "policies") if own.experiment["policies"] else ("rows", "methods")
-    tables = [getattr(one, kind) for one in (own, ours)]
-    keys = [key for key in _KEYS if key in tables[0]]
-    mine, theirs = (one.set_index(keys).drop(columns=_TIMES, errors="ignore") for one in tables)
-    common = mine.index.intersection(theirs.index)
-    first, second = mine.loc[common], theirs.loc[common]
-    equal = ((first == second) | (first.isna() & second.isna())).fillna(False).all(axis=1)
-    yield f"{equal.sum()} of {len(common)} rows that both have are the same to the bit"
-    yield from (f"differs: {dict(zip(keys, key, strict=True))}" for key in common[~equal][:1])
-    named = {group: {**own.experiment[group], **ours.experiment[group]}}
-    rows = {kind: pd.concat([tables[0][~mine.index.isin(common)], tables[1]])}
-    both = replace(ours, experiment={**ours.experiment, **named}, **rows)
-    if kind == "probes":
-        yield from sections.short_tables(both)
-    else:
-        beside = PACKAGE if PACKAGE in both.methods else "chsel"
-        yield sections.against_baseline(both, beside)[0]
 
 
 def ranked(name: str, to: str) -> list[str]:
@@ -312,13 +279,8 @@ def write(checked: bool = False) -> list[Path]:
 def main(arguments: list[str]) -> None:
     """See above."""
     verb, folders = (arguments or ["write"])[0], [Path(name) for name in arguments[1:]]
-    if verb not in ("write", "store", "rank") or bool(folders) != (verb != "write"):
+    if verb not in ("write", "store") or bool(folders) != (verb != "write"):
         sys.exit(f"{' '.join(arguments)} is none of:\n{__doc__}")
-    if verb == "rank":
-        console = Console()
-        for shown in rank(folders[0]):
-            print_table(console, shown) if isinstance(shown, Table) else console.print(shown)
-        return
     for folder in folders:
         store(folder)
     for page in write():

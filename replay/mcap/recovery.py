@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from chsel.errors import ChselError, RecordingError
 from chsel.events import (
@@ -21,10 +24,10 @@ from chsel.events import (
     SessionStarted,
 )
 from chsel.problem.points import KnownPoints
-from chsel.problem.sdf_grid import object_grid
+from chsel.problem.sdf_grid import OBJECT_PADDING, SdfGrid, object_grid
 from replay.files import new_file
 from replay.mcap.attachments import mesh_attached, sdf_attached, sdf_to_bytes
-from replay.mcap.encoding import decode
+from replay.mcap.encoding import decode, encode
 from replay.mcap.event_messages import (
     ImagePlace,
     RecordedDecision,
@@ -47,6 +50,9 @@ from replay.mcap.schemas import BEFORE_ALL_STEPS, RECORDS, SDF_GRID, STEP_TIME
 from replay.mcap.texts import one_line
 from replay.mcap.validation import RECOVERED, EventOrder
 from replay.mcap.writer import McapRecorder
+
+if TYPE_CHECKING:
+    import trimesh
 
 _PARTS = {
     "the registration": ("/problem", "/trace", "/archive", "/hypotheses"),
@@ -74,9 +80,10 @@ def recover(path: Path, out: Path) -> Recovered:
 
     That is everything up to the first damage, and in a finished file also each later chunk that its
     index names and whose checksum is right. Of what follows lost messages, only what does not need
-    them is kept. A damaged SDF grid is made again from the mesh if that gives its digest. Raises
-    RecordingError if the session's start is not whole, without which nothing makes sense; if `path`
-    is not a recording; or if `out` exists or cannot be written.
+    them is kept. A damaged SDF grid is made again from the mesh; if that does not give its digest,
+    the registrations and decisions on it are lost, and all else is kept. Raises RecordingError if
+    the rest of the session's start is not whole, without which nothing makes sense; if `path` is
+    not a recording; or if `out` exists or cannot be written.
     """
     recovery = _Recovery(path)
     with new_file(out) as beside:
@@ -111,6 +118,7 @@ class _Recovery:
         self._points = KnownPoints()  # those that are kept
         self._start: SessionStarted | None = None
         self._offered: ActionsOffered | None = None
+        self._another_grid = ""  # why the grid is not that of the session; "" if it is
 
     def events(self) -> Iterator[Event]:
         """Each event as it was; where some are lost, a warning; an end where there is none."""
@@ -158,7 +166,7 @@ class _Recovery:
         """The event that a message completes, if it still makes sense where it is."""
         topic, step = message.topic, message.log_time // STEP_TIME - 1
         if topic == "/session":
-            self._remake_grid(message)
+            message = self._with_grid(message)
         try:
             entry = self._reader.take(message)
             if entry is None:
@@ -174,6 +182,8 @@ class _Recovery:
         else:
             self._note(event)
             yield event
+            if event is self._start and self._another_grid:
+                yield from self._lost("the SDF grid", self._another_grid)
 
     def _completed(self, entry: Entry, message: StoredMessage) -> Event:
         """With its whole problem; RecordingError if something of lost messages is missing."""
@@ -214,23 +224,58 @@ class _Recovery:
             if self._start is not None and not self.found.ended:
                 yield Logged(self._order.step, "warning", f"{RECOVERED}lost: {what}: {reason}")
 
-    def _remake_grid(self, message: StoredMessage) -> None:
-        """Make a damaged SDF grid again as the session's configuration says, if that can be."""
+    def _with_grid(self, message: StoredMessage) -> StoredMessage:
+        """The session's message; a damaged SDF grid is made again as far as that can be.
+
+        If no grid of the mesh has the digest, one stands in, and the message names it: the session
+        can then be read, and what depends on the grid shows by its digest that it is another.
+        """
         attachments = self._file.attachments
-        values: dict[str, Any] = decode("Session", message.data)
+        values: dict[str, Any] = {}
         with suppress(*_WRONG):
+            values = decode("Session", message.data)
             sdf_attached(attachments, values["sdf_digest"])
-            return
+            return message
         with suppress(*_WRONG, LookupError, TypeError):
             mesh = mesh_attached(attachments, values["mesh_digest"])
-            session = config_from_json(values["config"])["session"]
-            padding = session["object_padding"]
-            grid = object_grid(mesh, session["object_resolution"], padding=padding)
-            self.found.remade = grid.digest == values["sdf_digest"]
-            attachments[SDF_GRID] = sdf_to_bytes(grid)
+            stand_in = None
+            for grid in _grids(mesh, values["config"], attachments):
+                stand_in = stand_in or grid
+                self.found.remade = grid.digest == values["sdf_digest"]
+                if self.found.remade:
+                    attachments[SDF_GRID] = sdf_to_bytes(grid)
+                    return message
+            if stand_in is not None:
+                self._another_grid = "it is damaged, and the mesh gives another, which stands in"
+                attachments[SDF_GRID] = sdf_to_bytes(stand_in)
+                data = encode("Session", values | {"sdf_digest": stand_in.digest})
+                return replace(message, data=data)
+        return message
 
     def _nothing(self, reason: str) -> str:
         damage = self._file.damage
         return f"nothing can be recovered from {self._path}: {reason}" + (
             f"; it is {damage}" if damage else ""
         )
+
+
+def _grids(
+    mesh: trimesh.Trimesh, config: str, attachments: Mapping[str, bytes]
+) -> Iterator[SdfGrid]:
+    """Grids that the session may have had: as configured, by default, as the damaged one begins."""
+    ways: list[tuple[float | None, float]] = [(None, OBJECT_PADDING)]
+    with suppress(*_WRONG, LookupError, TypeError):
+        session = config_from_json(config)["session"]
+        ways.insert(0, (session["object_resolution"], session["object_padding"]))
+    with suppress(*_WRONG, LookupError, TypeError):
+        damaged = decode("SdfGrid", attachments[SDF_GRID])
+        padding = round(float(np.max(mesh.bounds[0] - damaged["origin"])), 9)
+        ways.append((float(damaged["resolution"]), padding))
+    for resolution, padding in dict.fromkeys(ways):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the session gave those about its grid
+            try:
+                grid = object_grid(mesh, resolution, padding=padding)
+            except _WRONG:
+                continue
+        yield grid

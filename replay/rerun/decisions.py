@@ -33,7 +33,7 @@ class Decisions:
         self._expected: float | None = None  # spread after it, metres
 
     def set_up(self, actions: Actions) -> None:
-        """Store an arrow for each action."""
+        """Store an arrow for each action, from now on until others are offered."""
         if len(actions) == 0:
             return
         starts, ways = _starts(actions), _ways(actions)
@@ -41,7 +41,7 @@ class Decisions:
         longest = min(_ARROW * size, float(actions.length.max()))
         vectors = ways * (np.minimum(longest, actions.length) / actions.length)[:, None]
         arrows = rr.Arrows3D.from_fields(origins=starts, vectors=vectors)
-        self._stream.log("scene/actions/offered", arrows, static=True)
+        self._stream.log("scene/actions/offered", arrows)
 
     def draw(self, event: Decided) -> None:
         """Colour the actions by score, and show the chosen one with the contacts it forecasts."""

@@ -21,6 +21,7 @@ from rich.filesize import decimal
 
 from chsel.errors import RecordingError, SettingError
 from chsel.events import Believed, SensorImage
+from chsel.next_probe.decision_problem import Actions
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import inverse, quaternions
 from chsel.problem.registration_problem import ArchiveSnapshot
@@ -203,29 +204,26 @@ def exported_decisions(recording: Recording, steps: str | None) -> Exported:
     of probe K; `step_K/poses` (P, 4, 4), object_from_world, and `step_K/weights` (P,) of the
     belief; `step_K/available` (A,), `step_K/score` (A,), `step_K/hit_chance` (A,),
     `step_K/blocked_chance` (A,), `step_K/expected_spread` (A,), metres; `step_K/contacts` (P, 3),
-    where the chosen action meets the object in each pose, NaN where it does not; where other
-    actions were offered than at first, `step_K/world_from_hand` (A, 4, 4). Table: a row a decision;
-    x, y, z (metres) are the start of the chosen action, dx, dy, dz its direction.
+    where the chosen action meets the object in each pose, NaN where it does not. `actions/` has
+    the actions offered first; where a decision was on others, `step_K/world_from_hand`,
+    `step_K/length` and `step_K/seconds` have them. Table: a row a decision; x, y, z (metres) are
+    the start of the chosen action, dx, dy, dz its direction.
     """
     chosen = _chosen(recording, steps, recording.decision_steps, "decision")
     assert recording.offered is not None  # as there is a decision
-    actions = recording.offered.actions
-    arrays: dict[str, Any] = {
-        "steps": np.array(chosen, dtype=np.int64),
-        "actions/world_from_hand": actions.world_from_hand,
-        "actions/length": actions.length,
-    }
-    if actions.seconds is not None:
-        arrays["actions/seconds"] = actions.seconds
+    first = recording.offered.actions
+    arrays: dict[str, Any] = {"steps": np.array(chosen, dtype=np.int64)}
+    arrays |= {f"actions/{name}": part for name, part in _parts_of(first).items()}
     config, rows = recording.start.config.get("policy"), []
     policy = config.get("name", "") if isinstance(config, Mapping) else ""
     for step in chosen:
         decided = recording.decision(step)
         problem, decision = decided.problem, decided.decision
+        actions = problem.actions
         parts = {name: getattr(decision, name) for name in _OF_DECISIONS}
         parts |= {"surprise": decided.surprise, "available": problem.available}
-        if problem.actions.digest != actions.digest:
-            parts["world_from_hand"] = problem.actions.world_from_hand
+        if actions.digest != first.digest:
+            parts |= _parts_of(actions)
         parts |= {"poses": problem.belief.object_from_world, "weights": problem.belief.weights}
         arrays |= {f"step_{step}/{name}": part for name, part in parts.items()}
         numbers = np.full(6 + len(_OF_ACTIONS), np.nan)  # without an action
@@ -238,6 +236,12 @@ def exported_decisions(recording: Recording, steps: str | None) -> Exported:
         row |= dict(zip(names, numbers, strict=True))
         rows.append(row | {name: parts[name] for name in ("spread", "surprise", "stop")})
     return Exported(arrays.items(), pd.DataFrame(rows))
+
+
+def _parts_of(actions: Actions) -> dict[str, FloatArray]:
+    """The arrays of actions by their names, those that are there."""
+    parts = {field.name: getattr(actions, field.name) for field in fields(actions)}
+    return {name: part for name, part in parts.items() if part is not None}
 
 
 def exported_modes(recording: Recording, steps: str | None) -> Exported:

@@ -12,7 +12,12 @@ from hydra.errors import HydraException
 from chsel.errors import SettingError
 
 TRACEBACK = "--traceback"
-_FILES = {"align": ("file",), "plausible": ("file", "steps"), "report": ("dir",)}
+_FILES = {
+    "align": ("file",),
+    "plausible": ("file", "steps"),
+    "rank": ("dir",),
+    "report": ("dir",),
+}
 """Of a command: the settings that words without a key are; the last takes all that are left."""
 _OPEN_GROUPS = {"evaluate": ("settings", "outside", "policy"), "real": ("settings",)}
 """Of a command: groups that may have any key, which Hydra wants to have ++ before it."""

@@ -10,15 +10,17 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 from string import Template
 from typing import Any
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from chsel.errors import ChselError
+from chsel.errors import ChselError, SettingError
 from replay.console import print_error, print_page, print_warning
 from replay.startup import package_version, ready
 from runners.command.arguments import TRACEBACK, hydra_arguments
@@ -108,6 +110,18 @@ def plain(config: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in container.items()}
 
 
+def require_used(*keys: str, reason: str, accepted: str) -> None:
+    """Raise SettingError if one of these settings was typed, which the choices made do not use.
+
+    A key that ends in a dot is the settings of a group without its choice; else it is both.
+    """
+    for word in HydraConfig.get().overrides.task:
+        typed = word.lstrip("+~").partition("=")[0].partition("@")[0]
+        for key in keys:
+            if typed == key or typed.startswith(key if key.endswith(".") else f"{key}."):
+                raise SettingError(f"{typed} has no effect: {reason}; accepted: {accepted}")
+
+
 def _exit_on_error(run: Callable[[], None], config_name: str, show_traceback: bool) -> None:
     try:
         run()
@@ -131,6 +145,8 @@ def error_message(error: BaseException, config_name: str) -> str:
     cause = error.__cause__ if isinstance(error, HydraException) else None
     if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:
         group, _, choice = error.missing_cfg_file.rpartition("/")
+        if mesh := _mesh_as_object(error.missing_cfg_file):
+            return f"object has no option {mesh!r}; accepted: object=mesh object.path={mesh}"
         return _not_accepted(group, f"has no option {choice!r}", choice, list(error.options))
     if isinstance(error, OverrideParseException):
         what = error.message.splitlines()[0]
@@ -158,6 +174,12 @@ def _unknown_key(error: ConfigKeyError | ConfigAttributeError, config_name: str)
     where = f"{where}={node['name']}" if where == "method" else where
     accepted = [str(known) for known in node if known != "hydra"]
     return _not_accepted(where or config_name, f"has no key {name!r}", name, accepted)
+
+
+def _mesh_as_object(missing: str) -> str:
+    """The file that was given as the option of `object`, if it is the name of one; else ""."""
+    group, _, option = missing.partition("/")
+    return option if group == "object" and Path(option).suffix else ""
 
 
 def _not_accepted(where: str, what: str, value: str, accepted: list[str]) -> str:

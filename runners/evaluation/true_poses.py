@@ -20,11 +20,12 @@ from chsel.problem.poses import apply, compose, inverse, roll_pitch_yaw
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import CheckedSettings
 from chsel.problem.streams import StreamKey
+from runners.command.program import require_used
 from runners.evaluation.plan import Plan, Trial
 from runners.objects.loader import load_object
 from runners.objects.scans import AssetsConfig
 from runners.sensors.pose_file import SUFFIX, beside, read_pose, write_pose
-from runners.sessions.problem_source import Source, open_source
+from runners.sessions.problem_source import Source, is_recording, open_source
 from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
 from runners.simulated_robot.settings import RobotSettings
 
@@ -61,7 +62,11 @@ class SourceConfig(CheckedSettings):
         return Path(self.out).expanduser() if self.out else usual
 
     def open(self) -> Source:
-        """What the file holds."""
+        """What the file holds. Raises SettingError for settings that it makes useless."""
+        if is_recording(self.path):
+            accepted = "a raw log or known points with it"
+            reason = f"the recording {self.path} brings its own object and points"
+            require_used("object", "session", "session/rig", reason=reason, accepted=accepted)
         return open_source(self.path, self.object, self.session, self.assets.folder, self.seed)
 
 

@@ -34,6 +34,16 @@ class ObjectConfig(CheckedSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.path and self.kind != "file":
+            raise SettingError(
+                f"path is {self.path!r}, and object={self.name} has a mesh of its own; accepted: "
+                f"object=mesh object.path={self.path}"
+            )
+        if self.scan and self.kind != "scan":
+            raise SettingError(
+                f"scan is {self.scan!r}, and object={self.name} is not of a scan; accepted: "
+                "object=ycb/NAME with it"
+            )
         if self.kind == "file" and not self.path:
             raise SettingError("path is missing; pass object.path=FILE, a mesh file")
         if self.kind == "scan" and not self.scan:

@@ -45,6 +45,8 @@ _STOP_FACTOR = 1.5  # of the spread at which a session stops; an error above is 
 _ALL, _ALL_LEVELS = "all", "all levels"
 _PD = "PD in mm²"
 _RUN, BASELINE = "What was run", "All methods beside the baseline"
+_TRUTH_HELD = "Whether sets hold the truth"
+_FAULTS = "Faults, and whether sets hold the truth"
 _BUSY = "on one thread, after a warm-up. Several workers on one machine slow each other down."
 _LAST_HALF = (
     "Numbers are pooled over trials (a configuration with a seed) and over the steps of the last "
@@ -54,7 +56,7 @@ _TEXTS = {  # of sections, by title
     _RUN: "A trial is a configuration with a seed. What has failed is nowhere counted as a number.",
     "True poses": "The true pose of a recorded session is the one of least evaluation cost, after "
     "the last probe, near a pose that a person set (of a simulated log: its rounded truth).",
-    "Faults, and whether sets hold the truth": "Plausible sets are of the contacts without faults, "
+    _FAULTS: "Plausible sets are of the contacts without faults, "
     "see docs/faults.md. All other sections pool the levels. Distances are between surfaces.",
     BASELINE: "Over every step of every trial and draw. A ratio is PD by that of {baseline} at the "
     "same trial and step, by the geometric mean of its draws; worse is a ratio above 1. In ratios "
@@ -151,7 +153,7 @@ def _on_methods(
     parts: list[Part] = [
         (_RUN, _what_was_run(evaluation, rows, "method", styles), None),
         ("True poses", [true_pose_table(evaluation)], None),
-        ("Faults, and whether sets hold the truth", tables_by_faults(rows, styles), None),
+        (_FAULTS if has_faults(rows) else _TRUTH_HELD, tables_by_faults(rows, styles), None),
         (BASELINE, beside, None),
         ("Plausible diversity over the probes", by_step, over_probes),
         ("Plausible diversity by object and method", by_place, boxed),
@@ -225,8 +227,13 @@ def true_pose_table(evaluation: Evaluation) -> Table:
     return table_of("True poses found", lines, note=note)
 
 
+def has_faults(rows: pd.DataFrame) -> bool:
+    """Whether a session of these rows had faults."""
+    return not set(rows["faults"].dropna()) <= {CLEAN}
+
+
 def tables_by_faults(rows: pd.DataFrame, styles: Styles) -> list[Table]:
-    """Tables by level; none if no session had faults and no method has a set that holds poses."""
+    """Tables by level. Without faults: whether sets hold the truth, if a method says so."""
     levels = rows["faults"].fillna(CLEAN)
     order = [level for level in dict.fromkeys([*LEVELS, *levels]) if (levels == level).any()]
     rows = rows.assign(faults=levels)
@@ -242,6 +249,8 @@ def tables_by_faults(rows: pd.DataFrame, styles: Styles) -> list[Table]:
     having = {key: style for key, style in styles.items() if key in cells}
     note = "95 % intervals (Wilson) as if steps were independent; calibrated sets have 95 %."
     tables = [pivot_table("Steps with the true pose in the set", cells, having, note=note)]
+    if set(levels) <= {CLEAN}:
+        return tables
     for column, (title, factor) in _FAULTY_COLUMNS.items():
         scaled = rows.assign(**{column: factor * rows[column]})
         some = scaled.groupby("faults", observed=True)[column].transform("count") > 0
@@ -261,6 +270,7 @@ def against_baseline(evaluation: Evaluation, baseline: str) -> list[Table]:
         diversity, distinct = own[DIVERSITY], own["distinct"].dropna().astype(float)
         left_out = diversity.isna().sum()
         lower, median, upper = diversity.quantile([0.25, 0.5, 0.75])
+        lower = lower if diversity.count() > 1 else math.nan  # one number has no quartiles
         # The rounding of a geometric mean makes no PD worse.
         worse = percent((own["ratio"].dropna() > 1.0 + 1e-9).mean())
         lines.append(

@@ -28,7 +28,8 @@ _RESAMPLES, _FEW = 2000, 5
 def spreads(rows: pd.DataFrame, by: str | Sequence[str], column: str) -> pd.DataFrame:
     """A row per group with the spread of a column's numbers; NaN where there are none.
 
-    left_out: how many are missing. lower, upper: quartiles, interpolated. deviation: over n.
+    left_out: how many are missing. lower, upper: quartiles, interpolated; a single number has none.
+    deviation: over n.
     """
     groups = rows.astype({column: float}).groupby(by, observed=True)[column]
     count = groups.count()
@@ -36,9 +37,9 @@ def spreads(rows: pd.DataFrame, by: str | Sequence[str], column: str) -> pd.Data
         {
             "count": count,
             "left_out": groups.size() - count,
-            "lower": groups.quantile(0.25),
+            "lower": groups.quantile(0.25).where(count > 1),
             "median": groups.median(),
-            "upper": groups.quantile(0.75),
+            "upper": groups.quantile(0.75).where(count > 1),
             "mean": groups.mean(),
             "deviation": groups.std(ddof=0),
         }

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 GRID = "grid"
 """The policy of a session that is not steered: it probes in its own order."""
+PROBED_BY_US = ("simulated", "kinematic")
+"""Kinds of sessions that place the object and choose their probes themselves."""
 _OF_REAL_OBJECTS = ("points", "sensors")  # sessions whose points come from real objects
 FIRST_CONTACT = Start(contacts=1)
 """When a steered session begins to register."""

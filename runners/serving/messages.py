@@ -69,7 +69,7 @@ def open_session(body: bytes, folder: Path) -> tuple[Session, Json]:
     if request.hand is not None:
         arguments["hand"] = _mesh("hand", request.hand)
     if request.record is not None:
-        if Path(request.record).name != request.record:
+        if Path(request.record).name != request.record or not request.record.isprintable():
             accepted = "accepted: a name, of a file in the server's folder"
             raise SettingError(f"record is {quoted(request.record)}; {accepted}")
         arguments["record"] = str(folder.resolve() / request.record)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import secrets
 import traceback
+import zlib
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,13 +14,18 @@ from typing import Any, NamedTuple
 
 from aiohttp import web
 
-from chsel.errors import ChselError
+from chsel.errors import ChselError, SettingError, quoted
 from chsel.registration import one_line
 from chsel.session import Session
 from replay.console import print_error
 from runners.serving import messages
 
 MOST_BYTES = 256 * 2**20  # of a request
+PATIENCE = 0.5  # seconds that clients have to finish a request once the server ends
+_LONGEST_LINE = 2**16  # bytes, so that a long name is answered as others are
+_WITH_HEADER = 32 + zlib.MAX_WBITS  # of zlib: that of gzip or of deflate
+_LOGGER = logging.getLogger(__name__)  # of aiohttp, about what clients do wrong
+_LOGGER.addHandler(logging.NullHandler())
 
 
 class _Served(NamedTuple):
@@ -37,14 +44,18 @@ class Server:
         self._token, self._folder = token, folder
         self._served: dict[str, _Served] = {}
         self._count = 0  # sessions opened so far
+        self._ending = False  # nothing is begun any more
         self._opener = ThreadPoolExecutor(1)  # which compiles kernels and makes grids
-        self.app = web.Application(middlewares=[self._answered], client_max_size=MOST_BYTES)
+        connections = {"logger": _LOGGER, "max_line_size": _LONGEST_LINE, "auto_decompress": False}
+        self.app = web.Application(
+            middlewares=[self._answered], client_max_size=MOST_BYTES, handler_args=connections
+        )
         self.app.router.add_get("/sessions", self._list)
         self.app.router.add_post("/sessions", self._open)
         self.app.router.add_post(
             f"/sessions/{{name}}/{{verb:{'|'.join(messages.REQUESTS)}}}", self._ask
         )
-        self.app.on_cleanup.append(self._close_all)
+        self.app.on_shutdown.append(self._close_all)  # before clients are waited for
 
     @web.middleware
     async def _answered(
@@ -62,6 +73,10 @@ class Server:
             status, answer = 400, {"error": one_line(error)}
         except web.HTTPException as error:  # also of aiohttp, such as 404 for an unknown path
             status, answer = error.status, {"error": error.text}
+        except (ConnectionError, web.RequestPayloadError):  # nobody may be there to read this
+            status, answer = 400, {"error": "the body is cut; accepted: as long as it says"}
+        except OSError as error:  # of a file that a request names
+            status, answer = 400, {"error": one_line(error)}
         except Exception as error:
             traceback.print_exc()
             status, answer = 500, {"error": one_line(error)}
@@ -72,9 +87,10 @@ class Server:
         return {"sessions": [{**each.about, "step": each.session.step} for each in sessions]}
 
     async def _open(self, request: web.Request) -> Any:
-        return await _in_thread(self._opener, self._opened, await request.read())
+        return await _in_thread(self._opener, self._opened, await _body(request))
 
     def _opened(self, body: bytes) -> messages.Json:
+        self._check_open()
         session, about = messages.open_session(body, self._folder)
         self._count += 1
         about = {"session": str(self._count), **about}
@@ -82,25 +98,61 @@ class Server:
         return about
 
     async def _ask(self, request: web.Request) -> Any:
-        body = await request.read()
+        body = await _body(request)
         name, verb = request.match_info["name"], request.match_info["verb"]
         served = self._served.get(name)
         if served is None:
             accepted = ", ".join(self._served) or "none is open"
             raise web.HTTPNotFound(text=f"session {name} is not open; accepted: {accepted}")
-        answer = await _in_thread(served.thread, messages.answered, verb, served.session, body)
+        answer = await _in_thread(served.thread, self._asked, verb, served.session, body)
         if verb == "close":
             self._served.pop(name, None)
             served.thread.shutdown(wait=False)
         return answer
 
+    def _asked(self, verb: str, session: Session, body: bytes) -> messages.Json:
+        self._check_open()
+        return messages.answered(verb, session, body)
+
+    def _check_open(self) -> None:
+        """Raise HTTPServiceUnavailable if the server ends, for a request that waited."""
+        if self._ending:
+            raise web.HTTPServiceUnavailable(text="the server ends; accepted: nothing more")
+
     async def _close_all(self, _: web.Application) -> None:
-        """Wait for what is going on, and end every recording."""
-        self._opener.shutdown()
-        for served in self._served.values():
-            closing = served.thread.submit(served.session.close, "interrupted")
-            if (error := closing.exception()) is not None:
-                print_error(one_line(error))
+        """End every recording, each as soon as nothing is being computed for its session."""
+        self._ending = True
+        await self._close_served()
+        await _in_thread(self._opener, self._served.copy)  # once no session is being opened
+        await self._close_served()
+
+    async def _close_served(self) -> None:
+        served, self._served = self._served, {}
+        closing = [
+            _in_thread(each.thread, each.session.close, "interrupted") for each in served.values()
+        ]
+        for ended in await asyncio.gather(*closing, return_exceptions=True):
+            if isinstance(ended, Exception):
+                print_error(one_line(ended))
+
+
+async def _body(request: web.Request) -> bytes:
+    """The body of a request, unpacked. Raises SettingError if that cannot be done."""
+    body, encoding = await request.read(), request.headers.get("Content-Encoding", "").lower()
+    if encoding in ("", "identity"):
+        return body
+    if encoding not in ("gzip", "deflate"):
+        accepted = "accepted: gzip, deflate, or none"
+        raise SettingError(f"Content-Encoding is {quoted(encoding)}; {accepted}")
+    unpacking = zlib.decompressobj(_WITH_HEADER)
+    try:
+        body = unpacking.decompress(body, MOST_BYTES)
+    except zlib.error as error:
+        raise SettingError(f"the body is not {encoding} ({error})") from None
+    if not unpacking.eof:
+        accepted = f"accepted: a whole one of at most {MOST_BYTES} bytes"
+        raise SettingError(f"the body in {encoding} is cut, or too long; {accepted}")
+    return body
 
 
 async def _in_thread(

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import csv
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from chsel.errors import ChselError, PointsError, PoseError, SettingError, require_positive
+from chsel.errors import (
+    ChselError,
+    PointsError,
+    PointsWarning,
+    PoseError,
+    SettingError,
+    require_positive,
+)
 from chsel.events import Probe
 from chsel.numerics.arrays import FloatArray, IntArray, frozen, read_npz, refuse_special_file
 from chsel.problem.points import (
@@ -87,6 +96,7 @@ class PointsSession:
 
 KINDS = ("surface", "free", "occupied", "known")
 _COLUMNS = ["x", "y", "z", "kind", "sdf", "step"]
+_ACCEPTED = "x, y, z[, kind[, sdf]][, step], commas between them, decimal points in numbers"
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,19 +183,21 @@ def _read_csv(path: Path) -> PointFile:
         with warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):
             table = pd.read_csv(path, dtype=object, skipinitialspace=True, index_col=False)
     except (ValueError, pd.errors.ParserWarning) as error:
-        raise PointsError(f"not a readable .csv file ({' '.join(str(error).split())})") from None
+        raise PointsError(_wrong_length(path) or _unreadable(".csv", error)) from None
     table.columns = table.columns.str.strip()
-    if not set("xyz") | {"kind"} <= set(table.columns) <= set(_COLUMNS):
-        raise PointsError(
-            f"its columns are {', '.join(table.columns)}; accepted: x, y, z, kind[, sdf][, step]"
-        )
+    with_kind = "kind" in table
+    if not set("xyz") <= set(table) <= set(_COLUMNS) or ("sdf" in table and not with_kind):
+        raise PointsError(f"its columns are {', '.join(table.columns)}; accepted: {_ACCEPTED}")
+    if not with_kind:
+        table["kind"] = "surface"
     table = table.reindex(columns=_COLUMNS)
     kinds = table.pop("kind").astype(str).str.strip().to_numpy()
     known, given = kinds == "known", table["sdf"].notna().to_numpy()
+    table = table.fillna({"sdf": 0.0, "step": 0.0})
     try:
-        numbers = table.fillna({"sdf": 0.0, "step": 0.0}).to_numpy(float)
-    except ValueError as error:
-        raise PointsError(f"{error}; accepted: numbers") from None
+        numbers = table.to_numpy(float)
+    except ValueError:
+        raise PointsError(_not_a_number(table)) from None
     points, sdf, steps = numbers[:, :3], numbers[:, 3], numbers[:, 4]
     for wrong, what in (
         (~np.isin(kinds, KINDS), f"kind is none of {', '.join(KINDS)}"),
@@ -196,7 +208,39 @@ def _read_csv(path: Path) -> PointFile:
     ):
         if wrong.any():
             raise PointsError(f"row {np.argmax(wrong) + 1}: {what}")
+    if not with_kind:
+        text = f"point file {path} has no column kind: its points are read as points on the object"
+        warnings.warn(PointsWarning("kind", text), stacklevel=2)
     return PointFile(kinds, points, sdf, steps.astype(np.int64))
+
+
+def _wrong_length(path: Path) -> str:
+    """Which row of a .csv file has more values than there are columns; "" if none has."""
+    with suppress(ValueError, csv.Error), path.open(newline="", encoding="utf-8-sig") as file:
+        rows = csv.reader(file)
+        columns = len(next(rows, ()))
+        for number, row in enumerate(rows, 1):
+            if len(row) > columns:
+                what = f"row {number} has {len(row)} values for {columns} columns"
+                return f"{what}; accepted: {_ACCEPTED}"
+    return ""
+
+
+def _not_a_number(table: Any) -> str:
+    """The first value of a table that is not a number."""
+    for row, values in enumerate(table.itertuples(index=False), 1):
+        for name, value in zip(table.columns, values, strict=True):
+            try:
+                float(value)
+            except ValueError:
+                return f"row {row}: {name} is {str(value)!r}; accepted: a number such as 0.125"
+    raise AssertionError("all are numbers")
+
+
+def _unreadable(suffix: str, error: Exception) -> str:
+    """What a reader of a foreign format says, on one line."""
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return f"not a readable {suffix} file ({reason[:200]})"
 
 
 def _read_surface(path: Path) -> PointFile:
@@ -209,8 +253,7 @@ def _read_surface(path: Path) -> PointFile:
         geometries = list(getattr(loaded, "geometry", {"": loaded}).values())
         vertices = np.concatenate([_vertices(geometry) for geometry in geometries])
     except Exception as error:  # readers of foreign formats raise anything
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise PointsError(f"not a readable .{kind} file ({reason[:200]})") from None
+        raise PointsError(_unreadable(f".{kind}", error)) from None
     points = frozen("surface", vertices, (None, 3))
     nothing = np.zeros(len(points), dtype=np.int64)
     return PointFile(np.full(len(points), "surface"), points, nothing.astype(float), nothing)

@@ -91,9 +91,9 @@ def open_source(
     session: its settings, for what is not a recording; raw logs need those of kind "sensors", with
     which a .yaml is a depth image.
     """
-    is_mcap = path.suffix.lower() == ".mcap"
-    if is_mcap and _is_recording(path):
+    if is_recording(path):
         return _recorded(path)
+    is_mcap = path.suffix.lower() == ".mcap"
     kind, values = "points", {key: value for key, value in session.items() if key != "kind"}
     of_sensors = session.get("kind") == "sensors"
     is_frame = of_sensors and path.suffix.lower() in FRAME_SUFFIXES
@@ -131,8 +131,10 @@ def _recorded(path: Path) -> Source:
     return Source(start.object, start.mesh, truth, epsilon, steps, problems, file_digest(path))
 
 
-def _is_recording(path: Path) -> bool:
-    """Whether a file is a recording, by its header; also if that cannot be read."""
+def is_recording(path: Path) -> bool:
+    """Whether a file is a recording, by its name and header; also if that cannot be read."""
+    if path.suffix.lower() != ".mcap":
+        return False
     if not path.is_file():
         return True  # reading it reports what is wrong, as below
     try:

@@ -1,5 +1,6 @@
 """The programs and the notebook in examples/ print what they are there to show."""
 
+import json
 import os
 import re
 import runpy
@@ -39,3 +40,13 @@ def test_the_notebook_goes_from_contacts_to_one_mode(monkeypatch, tmp_path):
     assert re.search(r"several modes \(6 modes.*determined.* [01]\.\d mm from the true", text, re.S)
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
     assert "application/vnd.jupyter.widget-view+json" in outputs[-1]["data"]  # the viewer
+
+
+def test_the_notebook_is_kept_without_the_viewer():
+    """Which is 23 MB; CONTRIBUTING.md says how outputs are made without the cell of this tag."""
+    notebook = json.loads((EXAMPLES / "from_contacts_to_modes.ipynb").read_text())
+    *others, last = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert last["metadata"]["tags"] == ["viewer"]
+    assert last["outputs"] == []
+    assert all(cell["outputs"] for cell in others)
+    assert "widgets" not in notebook["metadata"]

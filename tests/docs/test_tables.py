@@ -18,7 +18,6 @@ from chsel.problem.points import Workspace
 from chsel.problem.settings import in_preset, settings_mapping
 from docs.results import make
 from examples.own_robot import FINGER, FakeRobot
-from runners.reporting.tables import Table
 from runners.sessions.probing_settings import ProbingSettings
 from tests.chsel.samples import REPOSITORY
 from tests.runners.made_up_evaluations import row, session, write_evaluation, write_sessions
@@ -40,6 +39,31 @@ def test_files_and_classes_that_the_page_of_the_architecture_names_exist():
     classes = {word for word in words if re.fullmatch(r"(?:[A-Z][a-z0-9]+){2,}", word)}
     assert len(classes) > 8
     assert {word for word in classes if not re.search(rf"\b{word}\b", text)} == set()
+
+
+PAGES = [REPOSITORY / name for name in ("README.md", "CONTRIBUTING.md")]
+PAGES += sorted(DOCS.glob("*.md"))
+LINK = re.compile(r"\]\((?!https?:)(?P<path>[^)#\s]*)(?:#(?P<section>[^)\s]+))?\)")
+
+
+def sections(page):
+    """The names by which links name the sections of a page, as GitHub makes them."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.M | re.S)
+    titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_and_named_sections_exist(page):
+    text, dead = page.read_text(), []
+    for link in LINK.finditer(text):
+        to = (page.parent / link["path"]).resolve() if link["path"] else page
+        if not to.exists() or (link["section"] and link["section"] not in sections(to)):
+            dead.append(link[0])
+    for name, title in re.findall(r'(README|CONTRIBUTING|\w+\.md), "([^"]+)"', text):
+        to = next(page for page in PAGES if page.name == f"{name.removesuffix('.md')}.md")
+        dead += [title] if title.lower().replace(" ", "-") not in sections(to) else []
+    assert dead == []
 
 
 def cells(title):
@@ -160,7 +184,7 @@ def test_objects_that_moved_are_judged_from_six_touches_on(tmp_path, monkeypatch
     columns["best_error"] = [0.5] * 6 + [0.006, 0.002]
     rows += session("can", 41, "random", [90.0] * 6 + [2.0, 4.0], verdict=["wide"] * 8, **columns)
     write_sessions(tmp_path / "made_up", rows, {"random": 8})
-    monkeypatch.setattr(make, "HERE", tmp_path)
+    monkeypatch.setattr(make, "KEPT", tmp_path)
     make.evaluation.cache_clear()
     found = [make.moved("made_up", column) for column in ("best_error", "error")]
     shown = [*found, make.wrong("made_up"), make.seeds("made_up")]
@@ -172,28 +196,8 @@ def test_seeds_of_a_method_are_those_that_it_ran_on(tmp_path, monkeypatch):
     seeds = {"icp": (3, 5, 4), "cvo": (4,)}
     rows = [row("can", seed, name, 0) for name, own in seeds.items() for seed in own]
     write_evaluation(tmp_path / "made_up", rows, methods={"icp": {}, "cvo": {}})
-    monkeypatch.setattr(make, "HERE", tmp_path)
+    monkeypatch.setattr(make, "KEPT", tmp_path)
     make.evaluation.cache_clear()
     shown = [make.seeds("made_up", name) for name in seeds]
     make.evaluation.cache_clear()
     assert shown == ["3..5", "4"]
-
-
-def test_an_entry_is_compared_to_the_bit_and_put_beside_the_others(tmp_path, monkeypatch):
-    monkeypatch.setattr(make, "HERE", tmp_path / "kept")
-    make.evaluation.cache_clear()
-    pd = {"package": (100.0, 200.0), "icp": (50.0, 50.0)}
-    kept = [row("can", 0, name, step, diversity=pd[name][step]) for name in pd for step in (0, 1)]
-    own = [one for one in kept if one["method"] == "icp"]
-    own[1] = own[1] | {"diversity": 50.000000000000007}  # the next number after 50
-    own += [row("can", 0, "mine", step, diversity=20.0) for step in (0, 1)]
-    write_evaluation(tmp_path / "kept/made_up", kept, methods={"icp": {}}, outside={"package": ""})
-    mine = write_evaluation(tmp_path / "mine", own, methods={"icp": {}, "mine": {}})
-    agreed, differs, table = make.rank(mine)
-    make.evaluation.cache_clear()
-    assert agreed == "1 of 2 rows that both have are the same to the bit"
-    assert "'step': 1, 'method': 'icp'" in differs
-    assert isinstance(table, Table)
-    ratio = table.header.index("ratio to package [95 %]")
-    found = {line[0]: float(line[ratio]) for line in table.rows}  # roots of .5 .25 and of .2 .1
-    assert found == pytest.approx({"mine": 0.1414, "ICP": 0.3536, "package": 1.0}, abs=1e-3)

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from chsel.events import Decided, ProblemPosed, SessionStarted
+from chsel.events import ActionsOffered, Decided, ProblemPosed, SessionStarted
 from chsel.next_probe.decision_problem import Actions
 from chsel.policies import build_policy
 from chsel.problem.poses import axis_angle, compose
@@ -20,6 +20,8 @@ from replay.mcap.reader import read_recording
 from replay.verbs.compare import policy_decisions
 from tests.replay.conftest import changed, nth, same_bits
 from tests.tools.small_recordings import STEERED, steered_session
+
+_ALONG = ("dx", "dy", "dz")
 
 
 @pytest.fixture
@@ -148,6 +150,40 @@ def test_decisions_are_exported_in_three_forms(steered_events, write, tmp_path):
         for name in ("score", "contacts", "hit_chance"):
             assert same_bits(arrays[f"step_{event.step}/{name}"], getattr(made, name))
         assert same_bits(arrays[f"step_{event.step}/poses"], event.problem.belief.object_from_world)
+
+
+def test_a_decision_on_other_actions_is_exported_with_theirs(steered_events, write, tmp_path):
+    """As of a program that offers new actions at each step, more of them, and turned hands."""
+    old = decided(steered_events, 1)
+    ten = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(1.1)), np.array([0.3, 0.2, 0.1]))
+    poses = np.tile(ten, (6, 1, 1))
+    poses[:, 0, 3] += 0.1 * np.arange(6)
+    others = Actions(poses, np.linspace(0.1, 0.2, 6))
+    scores = {name: np.full(6, 0.25) for name in ("score", "hit_chance", "blocked_chance")}
+    decision = dataclasses.replace(
+        old.decision, chosen=5, **scores, expected_spread=np.full(6, 0.01)
+    )
+    problem = dataclasses.replace(old.problem, actions=others, available=np.ones(6, dtype=bool))
+    new = dataclasses.replace(old, problem=problem, decision=decision)
+    offered = ActionsOffered(1, others, nth(steered_events, ActionsOffered).hand)
+    place = steered_events.index(old)
+    later = [event for event in steered_events[place + 1 :] if not isinstance(event, Decided)]
+    path = str(write([*steered_events[:place], offered, new, *later]))
+    for name in ("csv", "npz"):
+        out = str(tmp_path / f"out.{name}")
+        assert main(["export", path, "--what", "decisions", "-o", out]) == 0
+    rows = list(csv.DictReader((tmp_path / "out.csv").open(newline="")))
+    start, along = ([float(rows[-1][name]) for name in names] for names in ("xyz", _ALONG))
+    forward = ten @ [0.0, 0.0, 1.0, 0.0]
+    assert (int(rows[-1]["step"]), int(rows[-1]["chosen"])) == (1, 5)
+    assert start == pytest.approx([0.8, 0.2, 0.1], abs=1e-15)
+    assert along == pytest.approx(forward[:3], abs=1e-15)
+    arrays = np.load(tmp_path / "out.npz")
+    first = nth(steered_events, ActionsOffered).actions
+    assert same_bits(arrays["actions/world_from_hand"], first.world_from_hand)
+    assert same_bits(arrays["step_1/world_from_hand"], others.world_from_hand)
+    assert same_bits(arrays["step_1/length"], others.length)
+    assert not {"step_0/world_from_hand", "step_0/length", "step_1/seconds"} & {*arrays}
 
 
 def test_others_decide_on_the_recorded_problem(path):

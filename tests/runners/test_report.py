@@ -44,6 +44,15 @@ def test_quartiles_are_of_the_numbers_that_there_are():
     ]
 
 
+def test_without_faults_nothing_is_said_about_them(tmp_path):
+    rows = [row("can", 0, "icp", 4, diversity=8.0, truth_held=True, faults="clean")]
+    sections = sections_of(open_evaluation(write_evaluation(tmp_path, rows, methods={"icp": {}})))
+    assert not [section.title for section in sections if "aults" in section.title]
+    (held,) = [section for section in sections if section.title == "Whether sets hold the truth"]
+    (table,) = held.tables
+    assert table.rows == (("clean", "100 % [21, 100] (n 1)"),)
+
+
 def test_tables_hold_medians_over_trials_and_the_last_half_of_their_steps(tmp_path):
     values = {0: (1000.0, 10.0, 20.0), 1: (1000.0, 30.0, 60.0)}  # PD of seeds at steps 4, 5, 6
     rows = [
@@ -75,7 +84,7 @@ def test_what_has_no_number_is_left_out_and_counted(tmp_path):
     methods = {"chsel": {}, "icp": {}, "svgd": {}}
     write_evaluation(tmp_path, rows, configurations=["can"], seeds=[0, 1, 2], methods=methods)
     tables = tables_of(tmp_path)
-    left_out = ["can", "1", "8 [8, 8] (1 left out)", "-", "- (1 left out)"]
+    left_out = ["can", "1", "8 (1 left out)", "-", "- (1 left out)"]
     assert tables["PD in mm² by object"][1] == left_out
     assert tables["Time per registration in ms"][1:] == [
         ["CHSEL", "200", "100", "200 [150, 250]", "2"]

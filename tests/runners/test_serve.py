@@ -1,5 +1,6 @@
 import asyncio
 import base64
+import gzip
 import json
 import os
 import re
@@ -9,8 +10,10 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import urllib.error
 import urllib.request
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -19,6 +22,7 @@ import trimesh
 from aiohttp import web
 
 import chsel
+from chsel.errors import SessionError
 from replay.comparing.verification import EQUAL, verify
 from replay.mcap.reader import read_recording
 from runners.serving.server import Server
@@ -44,10 +48,11 @@ def server(tmp_path_factory):
     return f"127.0.0.1:{listening.getsockname()[1]}", folder
 
 
-def ask(address, path, body=None, *, token=TOKEN, **values):
+def ask(address, path, body=None, *, token=TOKEN, encoding="", **values):
     """The status and the answer to JSON of values, or to a body; without both, to a GET."""
     body = json.dumps(values).encode() if body is None and values else body
     headers = {"Authorization": f"Bearer {token}"} if token else {}
+    headers |= {"Content-Encoding": encoding} if encoding else {}
     request = urllib.request.Request(f"http://{address}{path}", body, headers)
     try:
         with urllib.request.urlopen(request) as answer:
@@ -154,11 +159,46 @@ def test_a_mistake_is_one_line(server):
         assert (status, answer["error"][: len(text)]) == (400, text)
         assert "\n" not in answer["error"]
     assert ask(address, "/sessions", b"{")[1]["error"].startswith("the body is not JSON (Expecting")
+    for where, body, text in (
+        (
+            "/sessions",
+            {"record": "a\0.mcap"},
+            "record is 'a\\x00.mcap'; accepted: a name, of a file",
+        ),
+        ("/sessions", {"record": f"{'a' * 5000}.mcap"}, f"recording {folder}/aaaa"),
+        ("/sessions", {"target": "a\0.obj"}, "mesh file a\0.obj does not exist; accepted: "),
+        ("/sessions", {"target": f"{'a' * 5000}.obj"}, ""),
+        ("/sessions", {"method": "a" * 5000}, "method is "),
+    ):
+        status, answer = ask(address, where, **(box | body))
+        assert (status, answer["error"][: len(text)]) == (400, text)
+        assert "\n" not in answer["error"]
+    assert ask(address, f"/sessions/{'a' * 20_000}/add", b"")[0] == 404
     assert [ask(address, f"{path}/close", b"")[0] for _ in range(2)] == [200, 404]
     refused = "the token is missing or wrong; accepted: Authorization: Bearer TOKEN"
     for token in ("", TOKEN[:-1], f"{TOKEN}."):
         for where in ("/sessions", "/elsewhere"):
             assert ask(address, where, token=token) == (401, {"error": refused})
+
+
+def test_a_body_is_unpacked_where_it_says_how(server):
+    address, _ = server
+    path, values = opened(address), json.dumps({"contacts": ON_BOX}).encode()
+    squeezed, whole = gzip.compress(values), zlib.compress(values)
+    for encoding, body, status, text in (
+        ("gzip", squeezed, 200, ""),
+        ("deflate", whole, 200, ""),
+        ("identity", values, 200, ""),
+        ("gzip", squeezed[:-9], 400, "the body in gzip is cut, or too long; accepted: a whole one"),
+        ("gzip", values, 400, "the body is not gzip (Error -3"),
+        ("br", values, 400, "Content-Encoding is 'br'; accepted: gzip, deflate, or none"),
+        ("zstd", values, 400, "Content-Encoding is 'zstd'; accepted: "),
+        ("x" * 5000, values, 400, "Content-Encoding is "),
+    ):
+        found = ask(address, f"{path}/add", body, encoding=encoding)
+        assert found[0] == status
+        assert found[1].get("error", "").startswith(text)
+    assert ask(address, "/sessions")[1]["sessions"][-1]["step"] == 2
 
 
 def test_a_client_that_hangs_up_leaves_the_session_and_its_recording_whole(server):
@@ -193,20 +233,82 @@ def test_packed_arrays_are_the_same_as_lists(server):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="there are no such signals on Windows")
-def test_the_command_serves_until_ctrl_c(tmp_path):
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_the_command_serves_until_a_signal_whatever_clients_do(tmp_path, ending):
     command = [sys.executable, "-m", "runners.serve", "port=0", f"folder={tmp_path}"]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     environment.pop("CHSEL_TOKEN", None)
-    served = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    served = subprocess.Popen(command, **pipes, text=True, env=environment)
     lines = iter(served.stdout.readline, "")
     address = next(found[1] for line in lines if (found := re.search(r"http://([\d.:]+)", line)))
     token = next(lines).removeprefix("token: ").strip()
     ask(address, "/sessions", token=token, target=TARGET, record="open.mcap")
     ask(address, "/sessions/1/add", token=token, contacts=ON_BOX)
     assert ask(address, "/sessions/1/register", b"", token=token)[0] == 200
-    served.send_signal(signal.SIGINT)
+    stalled, line = [], "POST /sessions/1/add HTTP/1.1\r\nHost: x\r\n"
+    parts = ("Content-Length: 9\r\n\r\n{", "Transfer-Encoding: chunked\r\n\r\n9\r\n{", "")
+    for part in parts:  # half a body, half a chunk, half of the headers
+        for hangs_up in (True, False):
+            connection = socket.create_connection(address.split(":"))
+            connection.sendall(f"{line}Authorization: Bearer {token}\r\n{part}".encode())
+            stalled.append(connection)
+            if hangs_up:
+                time.sleep(0.1)  # so that it is read by then
+                connection.close()
+    with socket.create_connection(address.split(":")) as connection:
+        connection.sendall(b"no HTTP\r\n\r\n")
+        assert connection.recv(12) == b"HTTP/1.0 400"
+    served.send_signal(ending)
+    begun = time.monotonic()
     assert served.wait() == 0
+    assert time.monotonic() - begun < 5.0  # 60 s if clients are waited for
     assert outcomes(tmp_path / "open.mcap") == ([0], "interrupted")
+    assert served.stderr.read() == ""
+
+
+def test_a_computation_holds_up_no_other_recording_and_what_waits_is_not_begun(
+    tmp_path, monkeypatch
+):
+    entered, go_on, begun = threading.Event(), threading.Event(), []
+
+    def slow(session):
+        begun.append(session)
+        entered.set()
+        assert go_on.wait(600)
+        raise SessionError("enough")
+
+    monkeypatch.setattr(chsel.Session, "register", slow)
+    listening, loop = socket.create_server(("127.0.0.1", 0)), asyncio.new_event_loop()
+    address = f"127.0.0.1:{listening.getsockname()[1]}"
+    runner = web.AppRunner(Server(TOKEN, tmp_path).app, shutdown_timeout=0.5)
+    loop.run_until_complete(runner.setup())
+    loop.run_until_complete(web.SockSite(runner, listening).start())
+    running = threading.Thread(target=loop.run_forever)
+    running.start()
+    busy, idle = (opened(address, record=f"{name}.mcap") for name in ("busy", "idle"))
+    for path in (busy, idle):
+        ask(address, f"{path}/add", contacts=ON_BOX)
+    with ThreadPoolExecutor(2) as pool:
+        asked = [pool.submit(ask, address, f"{busy}/register", b"")]
+        assert entered.wait(600)
+        asked.append(pool.submit(ask, address, f"{busy}/register", b""))
+        time.sleep(0.2)  # so that it waits
+        ended = asyncio.run_coroutine_threadsafe(runner.cleanup(), loop)
+        while not is_ended(tmp_path / "idle.mcap"):
+            time.sleep(0.01)
+        assert not is_ended(tmp_path / "busy.mcap")
+        go_on.set()
+        ended.result()
+        assert [answer.result()[0] for answer in asked] == [400, 503]
+    loop.call_soon_threadsafe(loop.stop)
+    running.join()
+    assert len(begun) == 1
+    assert read_recording(tmp_path / "busy.mcap").ended.outcome == "interrupted"
+
+
+def is_ended(path):
+    return read_recording(path, partial=True).ended is not None
 
 
 @pytest.mark.parametrize("kind", ["py", "cpp"])

@@ -6,6 +6,7 @@ import json
 import struct
 
 import pytest
+import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -21,8 +22,10 @@ from chsel.events import (
     SensorImage,
     SessionEnded,
     SnapshotTaken,
+    Traced,
 )
 from chsel.problem.sdf_grid import object_grid
+from chsel.session import Session
 from replay.__main__ import main
 from replay.comparing.verification import EQUAL, NO_RESULT, verify
 from replay.mcap.reader import read_recording
@@ -191,6 +194,73 @@ def test_a_damaged_grid_is_made_again_from_the_mesh(tmp_path, events, assert_sam
     assert main(["recover", str(path), "-o", str(tmp_path / "no.mcap")]) == 2
     assert "nothing can be recovered" in (error := capsys.readouterr().err)
     assert "attachment mesh.ply has digest" in error
+
+
+def live_session(path, **arguments):
+    """A session of a box of 40 x 60 x 80 mm, of two steps, and the events of its recording."""
+    box = trimesh.creation.box((0.04, 0.06, 0.08))
+    with Session(box, method="icp", record=path, **arguments) as session:
+        for z in (0.01, 0.02):
+            session.add(contacts=[[0.02, 0.0, z], [0.0, 0.03, z], [0.01, z, 0.04]])
+            session.register()
+    return list(read_recording(path).events())
+
+
+def damaged_grid(path):
+    """The bytes of a recording with one bit flipped amid its grid."""
+    data = path.read_bytes()
+    first, last = data.index(b"sdf_grid"), data.index(b"chsel.SdfGrid", data.index(b"sdf_grid"))
+    middle = last + len(read_recording(path).start.sdf.values.tobytes()) // 4
+    assert first < last < middle
+    return flipped(data, middle, middle)
+
+
+@pytest.mark.parametrize("arguments", [{}, {"resolution": 0.0045}])
+@pytest.mark.parametrize("earlier", [False, True])  # whose configuration lacks its settings
+def test_a_live_session_with_a_damaged_grid_comes_back_whole(
+    tmp_path, assert_same, arguments, earlier
+):
+    path = tmp_path / "whole.mcap"
+    written = live_session(path, **arguments)
+    if earlier:
+        config = {**written[0].config, "session": {"kind": "live"}}
+        written[0] = dataclasses.replace(written[0], config=config)
+        path.unlink()
+        recorded(path, written)
+    events, found = recovered(tmp_path, damaged_grid(path))
+    assert found.remade
+    assert not found.lost
+    assert_same(without_marks(events), written)
+    verdicts = verify(read_recording(tmp_path / "recovered.mcap"))
+    assert [verdict.outcome for verdict in verdicts] == [EQUAL, EQUAL]
+
+
+def test_a_grid_that_the_mesh_does_not_give_loses_the_registrations_alone(
+    tmp_path, assert_same, steered_events, capsys
+):
+    """As of a mesh whose distances came from another version of a library."""
+    sdf = steered_events[0].sdf
+    other = dataclasses.replace(sdf, values=sdf.values * 1.001)
+    posed = [
+        dataclasses.replace(event, problem=dataclasses.replace(event.problem, sdf=other))
+        if isinstance(event, ProblemPosed | Decided)
+        else event
+        for event in steered_events
+    ]
+    written = [dataclasses.replace(posed[0], sdf=other), *posed[1:]]
+    recorded(tmp_path / "whole.mcap", written)
+    events, found = recovered(tmp_path, damaged_grid(tmp_path / "whole.mcap"))
+    assert not found.remade
+    assert "the mesh gives another" in found.lost["the SDF grid"]
+    assert_same(probes(events), probes(written))
+    assert {"the registration of step 1", "/decision of step 1"} <= set(found.lost)
+    unlike = (ProblemPosed, Decided, HypothesesFound, SnapshotTaken, Traced)
+    assert not any(isinstance(event, unlike) for event in events)
+    numbers = [event for event in written if isinstance(event, Measured)]
+    assert_same([event for event in events if isinstance(event, Measured)], numbers)
+    start = read_recording(tmp_path / "recovered.mcap").start
+    assert start.sdf.digest != other.digest
+    assert tells_loss(events[1])
 
 
 examples = settings(

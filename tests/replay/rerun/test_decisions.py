@@ -86,6 +86,16 @@ def test_the_next_probe_and_its_forecast_stand_at_the_step_before_it(rows, step,
     np.testing.assert_allclose(forecast, [[0.0, 0.0, -0.15]], rtol=1e-6)
 
 
+def test_actions_that_are_offered_later_take_the_place_of_the_first(tmp_path):
+    fewer = Actions(ACTIONS.world_from_hand[[2, 1]], ACTIONS.length[[2, 1]])
+    before = [*session()][:-2]
+    later = [ActionsOffered(1, fewer, HAND), SessionEnded(1, "finished")]
+    rows = read(write(tmp_path / "b.rrd", [*before, *later]))["/scene/actions/offered"]
+    for step, actions in ((-1, ACTIONS), (0, ACTIONS), (1, fewer)):
+        starts = shown_at(rows, step)["Arrows3D:origins"]
+        np.testing.assert_allclose(starts, actions.world_from_hand[:, :3, 3], rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("name", "expected"),
     [

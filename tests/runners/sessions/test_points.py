@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.errors import PointsError, SettingError
+from chsel.errors import PointsError, PointsWarning, SettingError
 from chsel.problem.sdf_grid import object_grid
 from runners.objects.loader import ObjectModel
 from runners.sessions.points import PointsSession, PointsSettings, read_points
@@ -70,6 +70,15 @@ def test_csv_holds_every_kind_and_points_without_a_step_are_known_first(tmp_path
     np.testing.assert_array_equal(content.at(0).free, points)  # to the bit
 
 
+def test_a_csv_without_kinds_holds_surface_points_and_says_so(tmp_path):
+    path = text(tmp_path, "z,x,y,step\n3,1,2,0\n0.3,.1,.2,4\n")
+    with pytest.warns(PointsWarning, match=r"points.csv has no column kind: its points are"):
+        content = read_points(path)
+    for step, point in ((0, [1, 2, 3]), (4, [0.1, 0.2, 0.3])):
+        np.testing.assert_array_equal(content.at(step).contacts, [point])
+        assert len(content.at(step).free) == 0
+
+
 @pytest.mark.parametrize("suffix", ["ply", "off", "stl", "xyz"])
 def test_vertices_of_meshes_and_clouds_are_surface_points(tmp_path, suffix):
     path = tmp_path / f"points.{suffix}"
@@ -115,9 +124,14 @@ def test_malformed_arrays_are_named(tmp_path, arrays, message):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("x,y,z\n0,0,0\n", "its columns are x, y, z; accepted: x, y, z, kind"),
+        ("x,y\n0,0\n", r"its columns are x, y; accepted: x, y, z\[, kind"),
+        ("x,y,z,sdf\n0,0,0,1\n", r"its columns are x, y, z, sdf; accepted: x, y, z\[, kind"),
+        ("x;y;z\n0.5;1;2\n", "its columns are x;y;z; accepted: .* commas between them, decimal po"),
+        ("x;y;z\n0,5;0,1;0,2\n", "row 1 has 4 values for 1 columns; accepted: .* decimal points"),
+        ("x,y,z\n0,0,0\n0,1,0,2,0,3\n", "row 2 has 6 values for 3 columns; accepted: x, y, z"),
+        ('x,y,z\n0,"0,25",0\n', "row 1: y is '0,25'; accepted: a number such as 0.125"),
         ("x,y,z,kind\n0,0,0,solid\n", "row 1: kind is none of surface, free"),
-        ("x,y,z,kind\n0,b,0,free\n", "could not convert .*'b'; accepted: numbers"),
+        ("x,y,z,kind\n0,b,0,free\n", "row 1: y is 'b'; accepted: a number"),
         ("x,y,z,kind,sdf\n0,0,0,known,\n", "row 1: a known point needs an sdf"),
         ("x,y,z,kind,step\n0,0,0,free,1.5\n", "row 1: step is not an integer"),
     ],
