@@ -123,7 +123,7 @@ def test_points_far_off_all_poses_give_one_warning():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({}, "no point was given; accepted: surface, free"),
+        ({}, "no point was given; accepted: contacts, free"),
         ({"surface": 1000.0 * SURFACE}, r"the object is 0\.1.* m: are they in mill"),
         ({"known": POINT}, "known_sdf has 0 entries; accepted: one per known point, 1"),
         ({"method": "magic"}, "method is 'magic'; accepted: chsel"),
