@@ -105,11 +105,14 @@ MIXED = np.where(np.arange(80) < 40, 15, 700) * np.ones((60, 1), dtype=np.uint16
 FORM = r"not a pinhole camera's matrix; accepted: \[\[fx, 0, cx\], \[0, fy, cy\], \[0, 0, 1\]\]"
 REFUSED = (
     (IMAGE | {"camera": MATRIX.T}, FORM),
-    (IMAGE | {"camera": MATRIX + [[0, 9, 0], [0, 0, 0], [0, 0, 0]]}, FORM),
+    (IMAGE | {"camera": MATRIX + np.array([[0, 9, 0], [0, 0, 0], [0, 0, 0]])}, FORM),
     (IMAGE | {"camera": 2.0 * MATRIX}, FORM),
     (IMAGE | {"camera": MATRIX[:2]}, r"camera has shape \(2, 3\)"),
     (IMAGE | {"camera": MATRIX * [[1e6], [1e6], [1]]}, "camera fx is 90000000.0; accepted: at mo"),
-    (IMAGE | {"camera": MATRIX + [[0, 0, 2e6], [0, 0, 0], [0, 0, 0]]}, "cx, cy are 20000"),
+    (
+        IMAGE | {"camera": MATRIX + np.array([[0, 0, 2e6], [0, 0, 0], [0, 0, 0]])},
+        "cx, cy are 20000",
+    ),
     (IMAGE | {"depth": MIXED}, "whole numbers up to 700: millimetres"),
     (IMAGE | {"mask": np.full((60, 80), np.nan)}, r"mask\[0\] is not finite"),
     (IMAGE | {"mask": np.arange(4800.0).reshape(60, 80)}, "mask has 4799 values other than 0"),
@@ -175,7 +178,7 @@ def test_poses_points_and_rooms_in_millimetres_are_a_warning():
     session.add(contacts=CONTACTS)
     assert [warning.code for warning in session.warnings] == ["wide_workspace"]
     wall = chsel.Session(BOX, workspace=chsel.Workspace((300, 0, 0), (301, 1, 1)))  # of a map
-    wall.add(contacts=CONTACTS + [300.0, 0.0, 0.0])
+    wall.add(contacts=CONTACTS + np.array([300.0, 0.0, 0.0]))
     assert wall.warnings == []
 
 
