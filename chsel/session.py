@@ -326,7 +326,6 @@ class Session:
         self,
         *,
         contacts: Any = None,
-        surface: Any = None,
         free: Any = None,
         occupied: Any = None,
         known: Any = None,
@@ -338,6 +337,7 @@ class Session:
         camera: PinholeCamera | Any = None,
         world_from_camera: Any = None,
         mask: Any = None,
+        surface: Any = None,
     ) -> None:
         """Add what became known; it is in the recording when this returns.
 
@@ -346,7 +346,7 @@ class Session:
         the object that is measured again counts once.
         hand, path: a closed mesh in its own frame, and the poses world_from_hand (P, 4, 4) that it
         went through: its inside is free space. contact (3,): where it was stopped.
-        depth (H, W): metres along z, 0 or NaN where there is none, of a camera that is a
+        depth (H, W): metres along z, 0, NaN or masked where there is none, of a camera that is a
         PinholeCamera or a matrix (3, 3), at world_from_camera (4, 4): rays are free up to a voxel
         before what they see. mask (H, W): the object's pixels, which give points on it.
         Raises ChselError for malformed input and for what cannot be recorded, with nothing added;
