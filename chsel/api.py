@@ -9,11 +9,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from chsel.errors import MeshError, PointsError, PointsWarning, quoted, require_instance
-from chsel.methods import build_method, default_method, noise_of, preset_settings, trust_by
-from chsel.numerics.arrays import frozen
+from chsel.errors import (
+    MeshError,
+    PointsError,
+    PointsWarning,
+    quoted,
+    require_instance,
+    require_metres,
+)
+from chsel.methods import (
+    MOST_NOISE,
+    build_method,
+    default_method,
+    noise_of,
+    preset_settings,
+    trust_by,
+)
 from chsel.problem.mesh import clean_mesh
 from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import (
@@ -21,10 +32,17 @@ from chsel.problem.points import (
     KnownPoints,
     Workspace,
     check_contacts,
+    check_places,
     check_points,
+    check_workspace,
+    distinct_points,
     require_parts,
+    same_place,
     workspace_around,
+    world_known_points,
+    world_points,
 )
+from chsel.problem.poses import inverse
 from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import Hypotheses, Observer
 from chsel.problem.sdf_grid import SdfGrid, object_grid
@@ -37,7 +55,8 @@ if TYPE_CHECKING:
 
 def register(
     target: trimesh.Trimesh | SdfGrid,
-    *,
+    *unnamed: Any,
+    contacts: Any = None,
     surface: Any = None,
     free: Any = None,
     occupied: Any = None,
@@ -59,16 +78,17 @@ def register(
 ) -> Hypotheses:
     """Plausible poses of an object from what is known of points in the world.
 
-    target: the object's mesh in metres, or its signed distance grid. surface (M, 3), free (N, 3),
+    target: the object's mesh in metres, or its signed distance grid. contacts (M, 3), free (N, 3),
     occupied (K, 3): points on, outside and inside of the object. known (L, 3), known_sdf (L,):
-    points of known signed distance, metres. Numpy arrays, torch tensors or lists.
+    points of known signed distance, metres. Numpy arrays, torch tensors or lists. surface: another
+    name of contacts. A place on the object that is measured again counts once.
     method, preset: see chsel.methods; by default `anchored`, and in the presets paper and reference
     `chsel`, their method. settings: a mapping of single settings over the preset's, such as
     {"size": "large"}, or a whole settings object.
     hypotheses: B, 30 by default. workspace: where the object can be; by default the bounds of the
     points padded by the object's diameter. initial_set (B, 4, 4): E_0 as object_from_world.
     pushes: that may have moved the object while points became known, counted as free, occupied and
-    known, of which surface comes first; `anchored` finds where it is now.
+    known, of which contacts come first; `anchored` finds where it is now.
     previous: the last result, when points were added since (CHSEL, Alg. 2). resolution: of the
     SDF grid of a mesh, metres; by default that of `SdfGrid.from_mesh`. The grid is kept for the
     next call with this mesh. free_resolution: voxel side of free space, metres; used by free_term
@@ -80,7 +100,12 @@ def register(
     Warns with PointsWarning about points that are hardly meant, and where no hypothesis explains
     them, see chsel.problem.points and chsel.problem.trust.
     """
-    points = _known_points(surface, free, occupied, known, known_sdf)
+    if unnamed:
+        raise PointsError("points have no name; accepted: chsel.register(mesh, contacts=points)")
+    if contacts is not None and surface is not None:
+        raise PointsError("contacts and surface are two names of the same; accepted: one of them")
+    contacts = surface if contacts is None else contacts
+    given = _known_points(contacts, free=free, occupied=occupied, known=known, known_sdf=known_sdf)
     if workspace is not None:
         require_parts(workspace=workspace)
     if previous is not None:
@@ -90,7 +115,14 @@ def register(
     more = None if hypotheses is None else {"online": {"hypotheses": hypotheses}}
     solver = build_method(method, method_settings(method, preset, settings, more))
     sdf = _grid(target, resolution)
+    require_metres("noise", noise_of(solver), MOST_NOISE * sdf.diameter, sdf.diameter)
+    points, repeated = distinct_points(given, KnownPoints(), same_place(sdf.diameter))
+    if pushes is not None:  # which count the points
+        points, repeated = given, []
     _warn(check_points(points, sdf.diameter, free_resolution, workspace) + check_contacts(points))
+    _warn(repeated + check_places("the nearest known point", points.all_points(), sdf.diameter))
+    if workspace is not None:
+        _warn(check_workspace(workspace, sdf.diameter))
     workspace = workspace or workspace_around(points, sdf)
     online = OnlineRegistration(
         sdf,
@@ -104,6 +136,8 @@ def register(
     problem = online.pose(step)
     if initial_set is not None:
         problem = replace(problem, initial_set=initial_set)
+        places = inverse(problem.initial_set)[:, :3, 3]
+        _warn(check_places("initial_set", places, sdf.diameter, workspace))
     if pushes is not None:
         what = "chsel.Pushes(directions, before, largest)"
         require_instance("pushes", pushes, Pushes, what)
@@ -121,16 +155,12 @@ def _warn(points_warnings: list[PointsWarning]) -> None:
         warnings.warn(warning, stacklevel=3)
 
 
-def _known_points(surface: Any, free: Any, occupied: Any, known: Any, sdf: Any) -> KnownPoints:
+def _known_points(contacts: Any, **others: Any) -> KnownPoints:
     """All classes together; None stands for no points."""
-    none = np.zeros((0, 3))
-    surface, free, occupied, known = (
-        none if points is None else points for points in (surface, free, occupied, known)
-    )
-    others = KnownPoints(free, occupied, known, np.zeros(0) if sdf is None else sdf)
-    points = KnownPoints(known=frozen("surface", surface, (None, 3))).merged(others)
+    touched = KnownPoints(known=world_points("contacts", contacts))
+    points = touched.merged(world_known_points(**others))
     if points.count == 0:
-        raise PointsError("no point was given; accepted: surface, free, occupied or known points")
+        raise PointsError("no point was given; accepted: contacts, free, occupied or known points")
     return points
 
 

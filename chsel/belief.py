@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from chsel.errors import PoseError, SettingError, require_positive
+from chsel.errors import PoseError, SettingError, require_at_most, require_positive
 from chsel.events import Believed
 from chsel.next_probe.decision_problem import HandShape
 from chsel.numerics.arrays import FloatArray, IntArray, evenly_spaced, frozen
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
 _NORMAL = 1.6449  # standard deviations: 90 % of a normal distribution are within
 _SAME_MODE = 0.1  # of the diameter: as far as a mode moves from one result to the next
+_WIDEST = 2.0  # m: between fingers
 _FINEST = 0.002  # m: nodes of a hand that collides
 _NODES_ACROSS = 5.0  # of a hand
 _DRAWN = 1500  # points of a surface
@@ -73,6 +74,11 @@ class Mode:
     members: IntArray  # indices of poses
 
     @property
+    def world_from_object(self) -> FloatArray:
+        """Where the best member has the object in the world (4, 4)."""
+        return inverse(self.object_from_world)
+
+    @property
     def deviations(self) -> tuple[float, float]:
         """Root mean squares of how far members are off: of the centre, metres, and radians."""
         squares = np.diagonal(self.covariance)
@@ -97,6 +103,7 @@ class Gripper(CheckedSettings):
         super().__post_init__()
         for name, value in vars(self).items():
             require_positive(name, value)
+            require_at_most(name, value, _WIDEST)
 
 
 class PoseBelief:
@@ -181,6 +188,11 @@ class PoseBelief:
             if n not in given:
                 given[n], self.numbers = self.numbers, self.numbers + 1
         return [given[n] for n in range(len(firsts))]
+
+    @property
+    def world_from_object(self) -> FloatArray:
+        """Where the members have the object in the world (K, 4, 4)."""
+        return inverse(self.object_from_world)
 
     def event(self, step: int) -> Believed:
         """As recordings of a session have it."""
@@ -317,8 +329,10 @@ def grasps_work(
     grasps = frozen("world_from_gripper", world_from_gripper, (None, 4, 4), error=PoseError)
     grasps = nearest_rigid("world_from_gripper", grasps)
     widths = np.broadcast_to(np.asarray(width, dtype=np.float64), (len(grasps),))
-    if not ((widths > 0.0) & np.isfinite(widths)).all():
-        raise SettingError("width is not above 0; accepted: metres between the fingers")
+    if not ((widths > 0.0) & (widths <= _WIDEST)).all():
+        raise SettingError(
+            f"width is not above 0 and up to {_WIDEST:g}; accepted: metres between the fingers"
+        )
     fingers, between = _nodes(gripper)
     own = np.concatenate([fingers, between])  # of width 1, but for the fingers' thickness
     count = len(fingers)

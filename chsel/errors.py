@@ -92,6 +92,15 @@ def require_between(name: str, value: float, low: float, high: float) -> None:
         raise SettingError(f"{name} is {value}; accepted: {low:g} to {high:g} (m)")
 
 
+def require_metres(name: str, value: float, most: float, diameter: float) -> None:
+    """Raise SettingError if a length is above the most that an object of some diameter allows."""
+    if value > most:
+        raise SettingError(
+            f"{name} is {value:g} m, and the object is {diameter:.3g} m: in millimetres? accepted: "
+            f"at most {most:.3g} (m)"
+        )
+
+
 def require_positive(name: str, value: float, *, zero: bool = False) -> None:
     """Raise SettingError unless `value` is a finite number above zero (or at zero, if `zero`)."""
     finite = isinstance(value, int | float) and value == value and abs(value) != float("inf")

@@ -82,7 +82,8 @@ class SensorImage:
     step: int
     sensor: str  # its name in the rig
     kind: str  # "depth" of a camera, or "deformation" of a tactile pad
-    values: np.ndarray  # (H, W), uint16, in units of `unit`, 0 where there is no measurement
+    # (H, W), uint16, in units of `unit`; 0 where nothing is measured, or beyond the workspace
+    values: np.ndarray
     unit: float  # metres
     mask: np.ndarray  # (H, W): the pixels that count: those of free rays, or those in contact
     intrinsics: FloatArray  # (4,): fx, fy, cx, cy, pixels
@@ -266,6 +267,9 @@ Event = (
 
 class Recorder:
     """Writes nothing down; each kind of recorder does more in some of these methods."""
+
+    def check(self, event: Event) -> None:
+        """Raise RecordingError for an event whose values cannot be recorded."""
 
     def record(self, event: Event) -> None:
         """Take one event; events of one session come in the order in which things happen."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from chsel.errors import ChselError
 from chsel.events import (
+    Event,
     HypothesesFound,
     Measured,
     ProblemPosed,
@@ -98,11 +99,17 @@ def register_recorded(
     hypotheses = method.register(posed.problem, observer)
     seconds = dict(observer.seconds)
     seconds["other"] = time.perf_counter() - begun - sum(observer.seconds.values())
-    recorder.record(HypothesesFound(posed.step, hypotheses))
     trust = trust_by(method, posed.problem, hypotheses)
     truth = None if symmetry is None else world_from_object
     numbers = result_numbers(hypotheses, posed.problem, truth, symmetry, trust)
-    recorder.record(Measured(posed.step, numbers))
+    results: tuple[Event, ...] = (
+        HypothesesFound(posed.step, hypotheses),
+        Measured(posed.step, numbers),
+    )
+    for event in results:  # both or none
+        recorder.check(event)
+    for event in results:
+        recorder.record(event)
     return Registered(replace(hypotheses, trust=trust), numbers, seconds)
 
 
@@ -113,5 +120,10 @@ def symmetry_for_errors(start: SessionStarted) -> ObjectSymmetry | None:
 
 def one_line(error: BaseException) -> str:
     """The text of an error, with its class if it is none of ours."""
-    text = " ".join(str(error).split())
+    text = printable(" ".join(str(error).split()))
     return text if isinstance(error, ChselError) else f"{type(error).__name__}: {text}"
+
+
+def printable(text: str) -> str:
+    """A text whose control characters are shown by their codes, as recordings hold none."""
+    return "".join(c if c.isprintable() or c in "\n\t" else repr(c)[1:-1] for c in text)

@@ -7,13 +7,15 @@ CHSEL, Alg. 2, for programs. Everything that probes goes through this one class:
 from __future__ import annotations
 
 import json
+import threading
 import time
 import warnings
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import asdict, dataclass, replace
+from functools import wraps
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Concatenate, NamedTuple, ParamSpec, Self, TypeVar
 
 import numpy as np
 
@@ -26,7 +28,9 @@ from chsel.errors import (
     PoseError,
     SettingError,
     quoted,
+    require_between,
     require_instance,
+    require_metres,
     require_positive,
 )
 from chsel.events import (
@@ -41,12 +45,13 @@ from chsel.events import (
     SessionEnded,
     SessionStarted,
 )
-from chsel.methods import METHODS, build_method, default_method, noise_of
+from chsel.methods import METHODS, MOST_NOISE, build_method, default_method, noise_of
 from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
 from chsel.methods.method import Method
 from chsel.next_probe.action_lattice import ActionSettings, around_actions
 from chsel.next_probe.decision_problem import Actions, Decision, HandShape
-from chsel.numerics.arrays import BoolArray, FloatArray, evenly_spaced, frozen
+from chsel.numerics.arrays import BoolArray, FloatArray, evenly_spaced
+from chsel.numerics.threads import require_ieee_arithmetic
 from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
 from chsel.policies import POLICIES, build_policy
 from chsel.policies.policy import Policy
@@ -57,20 +62,25 @@ from chsel.problem.points import (
     FREE_RESOLUTION,
     KnownPoints,
     Workspace,
+    away_from,
     check_contacts,
     check_points,
+    check_workspace,
+    distinct_points,
     require_parts,
+    same_place,
     workspace_around,
 )
-from chsel.problem.poses import nearest_rigid
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
-from chsel.problem.sdf_grid import OBJECT_PADDING, object_grid
+from chsel.problem.sdf_grid import COARSEST, FINEST, OBJECT_PADDING, object_grid
 from chsel.problem.streams import StreamKey
 from chsel.problem.trust import check_trust
-from chsel.registration import Registered, one_line, register_recorded
+from chsel.registration import Registered, one_line, printable, register_recorded
 from chsel.rehearsal import warm_up, warm_up_policy, warm_up_sensing
-from chsel.sensing.depth_camera import DepthLook, PinholeCamera, depth_look, outside_of
-from chsel.sensing.free_space import FreeGrid, interior_lattice, poses_between
+from chsel.sensing.depth_camera import DepthLook, PinholeCamera, outside_of
+from chsel.sensing.free_space import FreeGrid
+from chsel.sensing.perception import Perception, farthest_depth, hand_bodies, perceived
+from chsel.session_recorder import SessionRecorder
 
 if TYPE_CHECKING:
     import trimesh
@@ -79,8 +89,23 @@ FROM_SESSION = "session"
 """The code of warnings that come with the points."""
 _CLOSE = 2.0  # noise levels: a misfit that needs no explanation
 _MOST_SHOWN = 200  # poses of a path, in recordings
-_ACROSS = 15.0  # to a diameter: points on the object that a depth image gives
 _UNIT = 1e-4  # m: of recorded depths, up to 6.5 m; of others a multiple of it
+_ROUNDING = 1e-9  # of a number of units
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+def _one_at_a_time(
+    method: Callable[Concatenate[Session, _P], _R],
+) -> Callable[Concatenate[Session, _P], _R]:
+    """A method of a session that waits for those that other threads have called."""
+
+    @wraps(method)
+    def locked(session: Session, *arguments: _P.args, **named: _P.kwargs) -> _R:
+        with session._lock:
+            return method(session, *arguments, **named)
+
+    return locked
 
 
 @dataclass(frozen=True)
@@ -101,8 +126,23 @@ class NextProbe(NamedTuple):
     decision: Decision  # with forecasts for all of them
 
 
+class Accepted(NamedTuple):
+    """What is added to a session, checked, and what the session becomes by it."""
+
+    started: SessionStarted
+    grid: FreeGrid
+    given: Perception
+    probe: Probe  # but for the points that become free
+    image: SensorImage | None
+    touching: KnownPoints  # without places that were measured before
+    seen: FloatArray  # (M, 3): the same of an image
+    warnings: list[InputWarning]
+
+
 class Session:
     """One object that is sought, from the first point to the last.
+
+    Threads may share it: each call waits for those before it.
 
     step: of the last points that were added, -1 before. warnings: so far, each kind once. answer:
     the last result, None before. trust: in it. stop: why `next_probe` gave None, "" if it did not.
@@ -157,17 +197,20 @@ class Session:
         else:
             policy_name = _name_of("policy", policy, POLICIES, build_policy)
         if not isinstance(hand, HandShape | None):
+            hand_bodies(hand)
             hand = HandShape.of(_mesh("hand", hand))
         self._hand = hand
         StreamKey(seed, 0)  # raises for an invalid seed
         require_positive("free_resolution", free_resolution)
+        require_between("free_resolution", free_resolution, FINEST, COARSEST)
         require_positive("moves", moves, zero=True)
         grid = None
         if workspace is not None:
             require_parts(workspace=workspace)
             grid = FreeGrid(workspace, free_resolution)
         sdf = object_grid(mesh, resolution)
-        recorder, environment = _recorder(record, live)
+        require_metres("noise", noise_of(method), MOST_NOISE * sdf.diameter, sdf.diameter)
+        require_metres("moves", moves, sdf.diameter, sdf.diameter)
         grid_settings = {  # by which a damaged grid can be made again
             "object_resolution": None if resolution is None else float(resolution),
             "object_padding": OBJECT_PADDING,
@@ -180,10 +223,17 @@ class Session:
             "preset": {"name": preset},
             "seed": seed,
         }
+        recorder, environment = _recorder(record, live)
         parts = name, "live", method_name, seed, config, mesh, sdf
         unknown = Workspace.around(np.zeros((1, 3)), sdf.diameter)  # until there are points
         given = workspace or unknown, free_resolution, KnownPoints(), None, environment
-        self._set_up(SessionStarted("session", *parts, *given), method, recorder)
+        advice = "; nothing of the session is lost, and it goes on without a recording"
+        self._set_up(SessionStarted("session", *parts, *given), method, recorder, advice)
+        self._recorder.check(self.started)
+        if workspace is not None:
+            self._opening: tuple[InputWarning, ...] = tuple(
+                check_workspace(workspace, sdf.diameter)
+            )
         self._policy, self._moves = policy, moves
         self._grid: FreeGrid | None = grid  # free space of what was added
         warm_up(method)
@@ -221,21 +271,28 @@ class Session:
         session._begin(online)
         session.steering = steering
         if steering is not None:
-            recorder.record(ActionsOffered(-1, steering.actions, steering.hand))
-        recorder.flush()
+            session._recorder.record(ActionsOffered(-1, steering.actions, steering.hand))
+        session.flush()
         return session
 
-    def _set_up(self, started: SessionStarted, method: Method, recorder: Recorder) -> None:
-        self.started, self.method, self._recorder = started, method, recorder
+    def _set_up(
+        self, started: SessionStarted, method: Method, recorder: Recorder, advice: str = ""
+    ) -> None:
+        self.started, self.method = started, method
+        self._recorder = SessionRecorder(recorder, advice)
+        self._lock = threading.RLock()  # of the calls from outside
         self._truth = started.world_from_object  # where the object is now, where that is known
         self._symmetry: ObjectSymmetry | None = None
-        self._opening: tuple[InputWarning, ...] = ()
+        self._opening = ()
         self._interval = 0
         self._show: Callable[[str, int, int], None] = lambda *_: None
         self._begun = self._closed = False
         self._moves = 0.0
         self._new_warnings: list[InputWarning] = []  # that `register` has not given yet
         self._grid = None
+        self._size = started.sdf.diameter  # metres, that the density of points depends on
+        self._since = KnownPoints()  # on the object, since it was pushed last
+        self._seen = np.zeros((0, 3))  # the same of depth images
         self.steering: Steering | None = None
         self.step = -1
         self.outcome = self.failure = self.stop = ""
@@ -268,6 +325,7 @@ class Session:
         self._recorder.record(started)
         self._begun = True
 
+    @_one_at_a_time
     def add(
         self,
         *,
@@ -283,92 +341,137 @@ class Session:
         camera: PinholeCamera | Any = None,
         world_from_camera: Any = None,
         mask: Any = None,
+        surface: Any = None,
     ) -> None:
         """Add what became known; it is in the recording when this returns.
 
         contacts (M, 3), free (N, 3), occupied (K, 3), known (L, 3) with known_sdf (L,): as in
-        `chsel.register`, world frame, metres. Free points are merged into voxels.
+        `chsel.register`, world frame, metres. Free points are merged into voxels, and a place on
+        the object that is measured again counts once.
         hand, path: a closed mesh in its own frame, and the poses world_from_hand (P, 4, 4) that it
         went through: its inside is free space. contact (3,): where it was stopped.
-        depth (H, W): metres along z, 0 or NaN where there is none, of a camera that is a
+        depth (H, W): metres along z, 0, NaN or masked where there is none, of a camera that is a
         PinholeCamera or a matrix (3, 3), at world_from_camera (4, 4): rays are free up to a voxel
         before what they see. mask (H, W): the object's pixels, which give points on it.
-        Raises ChselError for malformed input, with nothing added.
+        Raises ChselError for malformed input and for what cannot be recorded, with nothing added;
+        RecordingError once, with everything added, where the recording cannot be written any more.
         """
-        self._check_open()
-        if all(each is None for each in (contacts, free, occupied, known, path, contact, depth)):
-            raise PointsError("nothing was added; accepted: points, a path or a depth image")
-        if (hand is None) is not (path is None):
-            raise PointsError("hand and path belong together; accepted: both or none")
-        image = [each is not None for each in (depth, camera, world_from_camera)]
-        if any(image) is not all(image) or (mask is not None and depth is None):
-            raise PointsError(
-                "depth, camera and world_from_camera belong together, with or without mask; "
-                "accepted: all of them or none"
-            )
-        spacing, diameter = self.started.free_resolution, self.started.sdf.diameter
-        contacts, free = _rows("contacts", contacts), _rows("free", free)
-        if contact is not None:
-            contacts = np.concatenate([contacts, frozen("contact", contact, (3,))[None]])
-        sdf = np.zeros(0) if known_sdf is None else known_sdf
-        others = KnownPoints(
-            occupied=_rows("occupied", occupied), known=_rows("known", known), known_sdf=sdf
+        accepted = self.accepted(
+            contacts=contacts,
+            surface=surface,
+            free=free,
+            occupied=occupied,
+            known=known,
+            known_sdf=known_sdf,
+            hand=hand,
+            path=path,
+            contact=contact,
+            depth=depth,
+            camera=camera,
+            world_from_camera=world_from_camera,
+            mask=mask,
         )
-        inside, poses = np.zeros((0, 3)), np.zeros((0, 4, 4))
-        between, look = poses, None
-        if path is not None:
-            hand = _mesh("hand", hand)
-            poses = nearest_rigid("path", frozen("path", path, (None, 4, 4), error=PoseError))
-            inside = interior_lattice(hand, 0.5 * spacing)
-            radius = float(np.sqrt((hand.vertices**2).sum(axis=1)).max())
-            between = poses_between(poses, step=0.5 * spacing, radius=radius)
-        if depth is not None:
-            depth = frozen("depth", depth, (None, None), finite=False)
-            if mask is not None:
-                mask = frozen("mask", mask, (None, None), dtype=np.bool_)
-            seen_by, places = _camera(camera, depth), diameter / _ACROSS
-            look = depth_look(depth, seen_by, world_from_camera, mask, before=spacing, side=places)
-            others = others.merged(KnownPoints(known=look.surface))
-        touching = KnownPoints(known=contacts).merged(others)
+        self.take(accepted)
+
+    @_one_at_a_time
+    def accepted(self, **what: Any) -> Accepted:
+        """What is to be added, once all of it was checked; raises ChselError as `add` does."""
+        self._check_open()
+        if what.pop("surface", None) is not None:
+            raise PointsError("surface is the name in chsel.register; accepted: contacts=")
+        require_ieee_arithmetic()
+        spacing, diameter = self.started.free_resolution, self.started.sdf.diameter
+        given = perceived(**what, diameter=self._size, spacing=spacing)
+        look, step = given.look, self.step + 1
+        touching, found = distinct_points(given.touching, self._since, same_place(self._size))
+        seen = np.zeros((0, 3))
+        if look is not None:
+            seen = look.surface[away_from(look.surface, self._seen, given.spacing)]
+        on_object = touching.merged(KnownPoints(known=seen))
+        started, grid = self.started, self._grid
         if self._begun:
-            points = self.online.points.merged(touching)
-            check_points(points, diameter, spacing, self.started.workspace)
+            points = self.online.points.merged(on_object)
+            check_points(points, diameter, spacing, started.workspace)
         else:
-            check_points(touching, diameter, spacing)
-            passed = KnownPoints(free=np.concatenate([free, poses[:, :3, 3]]))
-            around = touching if touching.count else passed
+            check_points(on_object, diameter, spacing)
+            passed = KnownPoints(free=np.concatenate([given.free, given.path[:, :3, 3]]))
+            around = on_object if on_object.count else passed
             if around.count == 0:
                 raise PointsError(
                     "nothing says where the object can be; accepted: chsel.Session(..., "
                     "workspace=...), or first points, a path or a mask"
                 )
-            workspace = workspace_around(around, self.started.sdf)
-            self._grid = FreeGrid(workspace, spacing)
-            self.started = replace(self.started, workspace=workspace)
-            self._begin()
-        assert self._grid is not None
-        self._grid.at(free)
-        self._grid.at(inside, poses=between)
-        seen = np.zeros((0, 3))
-        if look is not None:
-            seen = look.surface
-            self._grid.from_depth(look.ends, look.camera, look.pose, look.rays, fraction=1.0)
-            self._recorder.record(_image(self.step + 1, look))
-        now_free = outside_of(seen, self._grid.new(), spacing)
-        outcome = "contact" if len(contacts) else "points" if others.count else "free"
+            workspace = workspace_around(around, started.sdf)
+            grid = FreeGrid(workspace, spacing)
+            started = replace(started, workspace=workspace)
+        assert grid is not None
+        outcome = "contact" if len(given.contacts) else "points" if given.others.count else "free"
         probe = Probe(
-            step=self.step + 1,
+            step=step,
             outcome="points" if look is not None else outcome,
-            new_points=KnownPoints(free=now_free).merged(touching),
-            gripper_path=poses[evenly_spaced(len(poses), _MOST_SHOWN)],
-            contacts=contacts,
-            contact_normals=np.zeros_like(contacts),
+            new_points=on_object,
+            gripper_path=given.path[evenly_spaced(len(given.path), _MOST_SHOWN)],
+            contacts=given.contacts,
+            contact_normals=np.zeros_like(given.contacts),
         )
-        if self._moves and probe.push is not None:  # what was free has moved with the object
-            self._grid = FreeGrid(self.started.workspace, spacing)
+        image = None
+        if look is not None:
+            farthest = farthest_depth(look, started.workspace)
+            look = look._replace(ends=np.minimum(look.ends, farthest))
+            image = _image(step, look, farthest)
+            self._recorder.check(image)
+        self._recorder.check(probe)
+        if not self._begun:
+            self._recorder.check(started)
+        before = started.workspace if self._begun else None
+        return Accepted(
+            started=started,
+            grid=grid,
+            given=given._replace(look=look),
+            probe=probe,
+            image=image,
+            touching=touching,
+            seen=seen,
+            warnings=[*found, *given.check(diameter, before)],
+        )
+
+    @_one_at_a_time
+    def take(self, accepted: Accepted) -> None:
+        """Let what was accepted become known, and record it."""
+        given, look, grid, probe = (
+            accepted.given,
+            accepted.given.look,
+            accepted.grid,
+            accepted.probe,
+        )
+        if not self._begun:
+            self.started, self._grid = accepted.started, grid
+            self._begin()
+        grid.at(given.free)
+        grid.at(given.hand, poses=given.swept)
+        surface = np.zeros((0, 3))
+        if look is not None:
+            surface = look.surface
+            grid.from_depth(look.ends, look.camera, look.pose, look.rays, fraction=1.0)
+        if accepted.image is not None:
+            self.observe(accepted.image)
+        free = outside_of(surface, grid.new(), self.started.free_resolution)
+        probe = replace(probe, new_points=KnownPoints(free=free).merged(probe.new_points))
+        self._seen = np.concatenate([self._seen, accepted.seen])
+        self._since = self._since.merged(accepted.touching)
+        if self._moves and probe.push is not None:  # what was known has moved with the object
+            self._grid = FreeGrid(self.started.workspace, self.started.free_resolution)
+            self._seen = np.zeros((0, 3))
+            self._since = KnownPoints()
         self.observe(probe)
+        self._warn(accepted.warnings)
         self.flush()
 
+    def count_places_for(self, diameter: float) -> None:
+        """Let the density of points be that of an object of another diameter, metres."""
+        self._size = diameter
+
+    @_one_at_a_time
     def observe(self, event: Event) -> None:
         """Record what happened; the new points of a Probe become known."""
         self._recorder.record(event)
@@ -379,7 +482,6 @@ class Session:
         self.step, self.outcome = event.step, event.outcome
         self.registered = self.problem = None
         self.failure, self.seconds = "", {}
-        self._warn(self._opening)
         steering = self.steering
         if (
             steering is not None
@@ -393,7 +495,9 @@ class Session:
         if event.world_from_object is not None:
             self._truth = event.world_from_object
         self.online.perceive(event.new_points, event.push)
+        self._warn(self._opening)
 
+    @_one_at_a_time
     def register(self) -> Hypotheses:
         """The plausible poses by all that is known, with how far to trust them (CHSEL, Alg. 1).
 
@@ -416,17 +520,19 @@ class Session:
             self.failed(error)
             raise
         finally:
+            found, self._new_warnings = self._new_warnings, []
+            for warning in found:
+                warnings.warn(warning, stacklevel=3)
             self.flush()
-            given, self._new_warnings = self._new_warnings, []
-            for warning in given:
-                warnings.warn(warning, stacklevel=2)
 
+    @_one_at_a_time
     def register_step(self) -> Hypotheses:
         """The same, but that the recording may be behind, and what is given is not checked."""
         found = self.register_problem(self.online.pose(self.step))
         self.online.remember(found)
         return found
 
+    @_one_at_a_time
     def register_problem(self, problem: RegistrationProblem) -> Hypotheses:
         """Register a problem of this step, and record it; the next one does not follow from it."""
         self.problem = problem
@@ -447,11 +553,14 @@ class Session:
             self._warn(check_trust(self.trust, noise_of(self.method)))
         return self.answer
 
+    @_one_at_a_time
     def failed(self, error: Exception) -> None:
         """Record why this step has no result."""
-        self.failure = one_line(error)
-        self._recorder.record(Logged(self.step, "warning", f"no result: {self.failure}"))
+        failure = one_line(error)
+        self._recorder.record(Logged(self.step, "warning", f"no result: {failure}"))
+        self.failure = failure
 
+    @_one_at_a_time
     def actions(self, settings: ActionSettings | None = None) -> Actions:
         """Straight probes from four sides and from above, where z is up and the floor at 0.
 
@@ -464,6 +573,7 @@ class Session:
         settings = settings or self._policy.settings.actions
         return around_actions(settings, self.started.workspace, self._hand)
 
+    @_one_at_a_time
     def next_probe(
         self,
         actions: Actions | None = None,
@@ -499,12 +609,18 @@ class Session:
         if not self._begun:
             raise SettingError("workspace is missing; accepted: workspace=, or points before this")
         if self.steering is None or actions.digest != self.steering.actions.digest:
-            place = self.started.sdf, self.started.workspace, self.started.free_resolution
-            if self.steering is None:
-                given = actions, hand
-                self.steering = Steering(self._policy, *place, *given, seed=self.started.seed)
-            self.steering.actions, self._taken = actions, set()
+            steering = self.steering or Steering(
+                self._policy,
+                self.started.sdf,
+                self.started.workspace,
+                self.started.free_resolution,
+                actions,
+                hand,
+                seed=self.started.seed,
+            )
             self._recorder.record(ActionsOffered(self.step, actions, hand))
+            steering.actions = actions
+            self.steering, self._taken = steering, set()
         available = np.ones(len(actions), dtype=bool)
         available[[*self._taken, *without]] = False
         decision = self.decide(available).decision
@@ -516,6 +632,7 @@ class Session:
         length = float(actions.length[chosen])
         return NextProbe(actions.world_from_hand[chosen], length, chosen, decision)
 
+    @_one_at_a_time
     def grasped(
         self, object_from_gripper: Any, width: Any, gripper: Gripper | None, sure: float
     ) -> bool:
@@ -533,6 +650,7 @@ class Session:
         self.stop = "grasp"
         return True
 
+    @_one_at_a_time
     def decide(self, available: BoolArray) -> Choice:
         """Choose one of the actions (A,) that are available, and record it."""
         assert self.steering is not None
@@ -545,11 +663,13 @@ class Session:
         self._decided = self.step
         return choice
 
+    @_one_at_a_time
     def flush(self) -> None:
         """Let all that was recorded survive the end of the process."""
         self._recorder.flush()
 
     @property
+    @_one_at_a_time
     def belief(self) -> PoseBelief:
         """What the last result says about the object; modes keep their numbers.
 
@@ -559,7 +679,7 @@ class Session:
             raise PoseError("nothing is registered yet; accepted: a belief after `register`")
         if self._belief is None or self._believed is not self.answer:
             symmetry = object_symmetry(self.started.mesh)
-            self._belief = PoseBelief(
+            belief = PoseBelief(
                 self.started.sdf,
                 self.answer,
                 symmetry,
@@ -567,11 +687,12 @@ class Session:
                 problem=self._answered,
                 noise=noise_of(self.method),
             )
-            self._believed = self.answer
             if self.registered is not None and not self._closed:
-                self._recorder.record(self._belief.event(self.step))
+                self._recorder.record(belief.event(self.step))
+            self._belief, self._believed = belief, self.answer
         return self._belief
 
+    @_one_at_a_time
     def check_moved(self, most: float = 0.02) -> float:
         """By how much each touch seems to have moved the object, metres, at most `most`; or 0.
 
@@ -594,16 +715,19 @@ class Session:
             self.flush()
         return distance
 
+    @_one_at_a_time
     def end_points(self) -> None:
         """Warn about points as they are at the end."""
         self._check_points()
         self._warn(check_contacts(self.online.points))
         self.flush()
 
+    @_one_at_a_time
     def close(self, outcome: str = "finished") -> None:
         """End the recording. Closing twice is closing once."""
         if self._closed:
             return
+        outcome = printable(outcome)
         self._closed = True
         level, step = "info" if outcome == "finished" else "warning", max(self.step, 0)
         try:
@@ -638,8 +762,8 @@ class Session:
         for warning in found:
             if warning.code not in {earlier.code for earlier in self.warnings}:
                 step = max(self.step, 0)
+                self._recorder.record(Logged(step, "warning", printable(warning.text)))
                 self.warnings.append(StepWarning(step, warning.code, warning.text))
-                self._recorder.record(Logged(step, "warning", warning.text))
                 self._new_warnings.append(warning)
 
     def _check_open(self) -> None:
@@ -671,7 +795,7 @@ def _recorder(record: str | Path | Recorder | None, live: bool) -> tuple[Recorde
 def _mesh_of(target: trimesh.Trimesh | str | Path) -> tuple[trimesh.Trimesh, str]:
     """The object's mesh, and its name."""
     if isinstance(target, str | Path):
-        return load_mesh(target), Path(target).stem
+        return load_mesh(target), printable(Path(target).stem)
     mesh = _mesh("target", target)
     return clean_mesh(mesh.vertices, mesh.faces, name="target"), "object"
 
@@ -697,24 +821,11 @@ def _plain(settings: Any) -> dict[str, Any]:
     return dict(json.loads(json.dumps(asdict(settings))))
 
 
-def _rows(name: str, given: Any) -> FloatArray:
-    """Points (N, 3), none for None."""
-    return frozen(name, np.zeros((0, 3)) if given is None else given, (None, 3))
-
-
-def _image(step: int, look: DepthLook) -> SensorImage:
-    """A depth image as recordings have it."""
-    unit = _UNIT * np.ceil(max(float(look.depth.max()) / (65535 * _UNIT), 1.0))
-    values = np.rint(look.depth / unit).astype(np.uint16)
+def _image(step: int, look: DepthLook, farthest: float) -> SensorImage:
+    """A depth image as recordings have it: without depths beyond the farthest, metres."""
+    depth = np.where(look.depth > farthest, 0.0, look.depth)
+    unit = _UNIT * np.ceil(max(float(depth.max()) / (65535 * _UNIT) - _ROUNDING, 1.0))
+    values = np.rint(depth / unit).astype(np.uint16)
     camera = look.camera
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     return SensorImage(step, "camera", "depth", values, unit, look.rays, intrinsics, look.pose)
-
-
-def _camera(camera: Any, depth: FloatArray) -> PinholeCamera:
-    """The camera of an image (H, W), also of a matrix (3, 3)."""
-    if isinstance(camera, PinholeCamera):
-        return camera
-    matrix = frozen("camera", camera, (3, 3), error=SettingError)
-    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
-    return PinholeCamera(depth.shape[1], depth.shape[0], fx, fy, cx, cy)

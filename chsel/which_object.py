@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -57,6 +58,7 @@ class WhichObject:
             shown = quoted(list(targets))
             raise SettingError(f"targets are {shown}; accepted: two or more, of different names")
         self.sessions: dict[str, Session] = {}
+        self._lock = threading.RLock()
         self.candidates: list[Candidate] = []
         self._offered: Actions | None = None
         self._taken: set[int] = set()  # of these
@@ -68,11 +70,17 @@ class WhichObject:
                 session = Session(target, record=own, noise=noise, **given)
                 self.sessions[name] = opened.enter_context(session)
             self._open = opened.pop_all()
+        smallest = min(session.started.sdf.diameter for session in self.sessions.values())
+        for session in self.sessions.values():
+            session.count_places_for(smallest)
 
     def add(self, **what: Any) -> None:
-        """Add what became known to all, see `Session.add`."""
-        for session in self.sessions.values():
-            session.add(**what)
+        """Add what became known to all, or to none, see `Session.add`."""
+        sessions = self.sessions.values()
+        with self._lock, ExitStack() as taken:
+            accepted = [session.accepted(**what) for session in sessions]
+            for session, one in zip(sessions, accepted, strict=True):
+                taken.callback(session.take, one)  # all of them, whatever one raises
 
     def register(self) -> list[Candidate]:
         """Register every object; the likeliest first.

@@ -25,8 +25,8 @@ TOUCHED = """0.5028,0.0938,0.0758
 
 files = sys.argv[1:] or (MUSTARD, TOUCHED.splitlines())
 mesh, contacts = chsel.load_mesh(files[0]), np.loadtxt(files[1], delimiter=",", ndmin=2)
-hypotheses = chsel.register(mesh, surface=contacts)
+hypotheses = chsel.register(mesh, contacts=contacts)
 print(f"{len(contacts)} contacts: {hypotheses.trust}")
 for index in hypotheses.trust.best_of_modes:
-    world_from_object = np.linalg.inv(hypotheses.object_from_world[index])
+    world_from_object = hypotheses.world_from_object[index]
     print(f"world_from_object of a mode:\n{world_from_object.round(3)}")

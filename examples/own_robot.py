@@ -36,5 +36,5 @@ if __name__ == "__main__":
             session.add(hand=FINGER, path=path, contact=contact)
             apart = 1e3 * session.register().trust.spread
             print(f"touch {session.step}: {session.outcome}, poses {apart:.0f} mm apart")
-    error = np.linalg.norm((np.linalg.inv(session.answer.object_from_world[0]) - TRUTH)[:3, 3])
+    error = np.linalg.norm((session.answer.world_from_object[0] - TRUTH)[:3, 3])
     print(f"stopped by {session.stop}: the best pose is off by {1e3 * error:.1f} mm")

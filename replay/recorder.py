@@ -66,6 +66,11 @@ class Recorders(Recorder):
         self._jobs: deque[Future[None]] = deque()  # of the thread
         self._ended = False  # whether an error has ended drawing
 
+    def check(self, event: Event) -> None:
+        """Raise RecordingError for an event that a file cannot hold."""
+        for recorder in self._files:
+            recorder.check(event)
+
     def record(self, event: Event) -> None:
         """Keep the event for a while."""
         self._waiting.append(event)

@@ -45,6 +45,7 @@ _OURS: dict[str, Entry[Method]] = {
     "anchored": (Anchored, AnchoredSettings()),
 }
 OURS = tuple(_OURS)
+MOST_NOISE = 0.25  # of points, in diameters of the object: more is in millimetres
 
 
 def _lacks(method: Any) -> str | None:

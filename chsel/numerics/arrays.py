@@ -44,18 +44,26 @@ def frozen(
     dtype: Any = np.float64,
     error: type[ChselError] = PointsError,
     finite: bool = True,
+    most: float = math.inf,
 ) -> NDArray[Any]:
     """A read-only, C-ordered copy of `value` with the given shape (None: any length).
 
-    Takes numpy arrays, torch tensors and nested lists. Raises `error` with `name` in the message
-    if the value is not an array of numbers, has another shape, or, where it must be finite, holds a
-    value that is not.
+    Takes numpy arrays, torch tensors and nested lists. most: the largest coordinate, metres.
+    Raises `error` with `name` in the message if the value is not an array of real numbers, has
+    masked values or another shape, or, where it must be finite, holds a value that is not.
     """
     torch = sys.modules.get("torch")  # importing it takes seconds; a tensor's owner has done so
     try:
         if torch is not None and isinstance(value, torch.Tensor):
             value = value.detach().cpu().numpy()
-        array = np.array(value, dtype=dtype, order="C")
+        parts = value if isinstance(value, list | tuple) else [value]
+        if any(np.ma.is_masked(part) for part in parts):
+            raise error(f"{name} has masked values; accepted: an array without, such as x[~x.mask]")
+        given = np.asarray(value)
+        objects = given.flat if given.dtype.kind == "O" else ()
+        if given.dtype.kind not in "biufO" or any(isinstance(each, str) for each in objects):
+            raise TypeError
+        array = np.array(given, dtype=dtype, order="C")
     except (TypeError, ValueError, OverflowError):
         raise error(f"{name} is not an array of numbers; accepted: shape {_show(shape)}") from None
     fits = array.ndim == len(shape)
@@ -67,6 +75,9 @@ def frozen(
     if finite and not np.isfinite(array).all():
         row = int(np.argwhere(~np.isfinite(array))[0][0]) if array.ndim else 0
         raise error(f"{name}[{row}] is not finite; accepted: finite numbers")
+    if most < math.inf and np.abs(array).max(initial=0.0) > most:
+        row = int(np.argwhere(np.abs(array) > most)[0][0])
+        raise error(f"{name}[{row}] has {np.abs(array[row]).max():g}; accepted: up to {most:g} (m)")
     array.setflags(write=False)
     return array
 

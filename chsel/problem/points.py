@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -29,12 +29,19 @@ from chsel.numerics.cell_set import bounds_of, set_voxels
 from chsel.problem.sdf_grid import SdfGrid
 
 FREE_RESOLUTION = 0.01  # side of a voxel of free space, metres
+FARTHEST_PLACE = 1e5  # coordinates in the world, metres: turned, they are still within FARTHEST
+MANY_REPEATED = 0.1  # share of points at places that were measured before
+SAME_PLACE = 0.003  # metres: contacts nearer to an earlier one measure the same place again
 
 # In diameters of the object:
 MOST_APART = 10.0  # between contacts, and from a contact to the free points
 NEVER_APART = 100.0  # between contacts: a tenth of an object whose points are in millimetres
 NEVER_AROUND = 1000.0  # between any points: an object whose points are in millimetres
 MOST_OUTSIDE = 0.2  # from the workspace to a contact
+MOST_SAME = 0.05  # the largest SAME_PLACE
+MOST_AWAY = 100.0  # from the world's origin, or the workspace, to what a robot does
+
+_LEAST_AWAY = 50.0  # the same for small objects, metres
 
 _CLASSES = ("free", "occupied", "known", "known_sdf")
 _BLOCK = np.array(list(np.ndindex(3, 3, 3))) - 1  # a voxel, at index 13, and its 26 neighbours
@@ -49,13 +56,19 @@ def _no_points() -> FloatArray:
 class KnownPoints(ShapesShown):
     """Known points in world coordinates, metres, by their semantics (CHSEL, Sec. III).
 
-    Raises PointsError for wrong shapes and values that are not finite.
+    Arguments are given by name, as free points are first. Raises PointsError for wrong shapes and
+    values that are not finite.
     """
 
     free: FloatArray = field(default_factory=_no_points)  # (N, 3), outside of the object
     occupied: FloatArray = field(default_factory=_no_points)  # (K, 3), inside of it
     known: FloatArray = field(default_factory=_no_points)  # (M, 3), of known signed distance
     known_sdf: FloatArray | None = None  # (M,), that distance; None: 0 for all, contacts
+
+    def __new__(cls, *unnamed: Any, **named: Any) -> Self:
+        if len(unnamed) == 1 and not named:
+            raise PointsError("points have no name; accepted: KnownPoints(free=..., known=...)")
+        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         for name in ("free", "occupied", "known"):
@@ -111,9 +124,11 @@ class Workspace:
     """The box of the world in which the object must be."""
 
     lower: tuple[float, float, float]  # corners, metres
-    upper: tuple[float, float, float]
+    upper: tuple[float, float, float] = ()  # type: ignore[assignment]  # so that we say what lacks
 
     def __post_init__(self) -> None:
+        if np.size(self.upper) == 0:
+            raise PointsError("workspace has one corner; accepted: chsel.Workspace(lower, upper)")
         lower, upper = frozen("workspace", (self.lower, self.upper), (2, 3))
         if not (upper > lower).all():
             raise PointsError(
@@ -135,9 +150,130 @@ class Workspace:
         return cls(tuple(lower.tolist()), tuple(upper.tolist()))
 
 
+def world_points(name: str, given: Any) -> FloatArray:
+    """Points (N, 3) as a program or a file gives them, metres; none for None.
+
+    Raises PointsError for what is not such an array, and places beyond FARTHEST_PLACE.
+    """
+    given = _no_points() if given is None else given
+    return frozen(name, given, (None, 3), most=FARTHEST_PLACE)
+
+
+def world_known_points(
+    *, free: Any = None, occupied: Any = None, known: Any = None, known_sdf: Any = None
+) -> KnownPoints:
+    """The same of all classes; a known point needs its signed distance."""
+    sdf = np.zeros(0) if known_sdf is None else known_sdf
+    return KnownPoints(
+        free=world_points("free", free),
+        occupied=world_points("occupied", occupied),
+        known=world_points("known", known),
+        known_sdf=frozen("known_sdf", sdf, (None,), most=FARTHEST_PLACE),
+    )
+
+
 def workspace_around(points: KnownPoints, sdf: SdfGrid) -> Workspace:
     """Where an object can be that touches some of the points: their bounds and its diameter."""
     return Workspace.around(points.all_points(), sdf.diameter)
+
+
+def check_places(
+    name: str, places: FloatArray, diameter: float, workspace: Workspace | None = None
+) -> list[PointsWarning]:
+    """A warning if places (N, 3) are so far away that they may be in millimetres.
+
+    That is, all far from the world's origin and from the workspace, where there is one. diameter:
+    of the object, metres.
+    """
+    if len(places) == 0:
+        return []
+    lower, upper = np.zeros((2, 3)) if workspace is None else workspace.bounds
+    lower, upper = np.minimum(lower, 0.0), np.maximum(upper, 0.0)
+    beyond = np.maximum(np.maximum(lower - places, places - upper), 0.0)
+    nearest = float(np.sqrt((beyond**2).sum(axis=1)).min())
+    if nearest <= max(MOST_AWAY * diameter, _LEAST_AWAY):
+        return []
+    away = "the world's origin" if workspace is None else "the workspace and the world's origin"
+    text = f"{name} is {nearest:.4g} m from {away}: in millimetres? accepted: metres"
+    return [PointsWarning("far_away", text)]
+
+
+def check_workspace(workspace: Workspace, diameter: float) -> list[PointsWarning]:
+    """A warning if a workspace is so wide that it may be in millimetres; diameter: metres.
+
+    Raises PointsError for corners beyond FARTHEST_PLACE.
+    """
+    frozen("workspace", workspace.bounds, (2, 3), most=FARTHEST_PLACE)
+    widest = float(np.ptp(workspace.bounds, axis=0).max())
+    if widest <= max(MOST_AWAY * diameter, _LEAST_AWAY):
+        return []
+    text = f"workspace is {widest:.4g} m wide, and the object {diameter:.3g} m: in millimetres?"
+    return [PointsWarning("wide_workspace", f"{text} accepted: metres")]
+
+
+def same_place(diameter: float) -> float:
+    """Up to which distance (metres) points on an object measure the same place."""
+    return min(SAME_PLACE, MOST_SAME * diameter)
+
+
+def distinct_points(
+    new: KnownPoints, earlier: KnownPoints, apart: float
+) -> tuple[KnownPoints, list[PointsWarning]]:
+    """New points without those at a place that was measured before, and a warning about them.
+
+    Such points have one error in common, so they count once: occupied and known points farther than
+    `apart` metres from all earlier ones are kept, by position and signed distance. Free points are
+    all kept. A few such points, as in a dense scan, are no warning.
+    """
+    known, before = (np.column_stack([each.known, each.sdf]) for each in (new, earlier))
+    fresh = first_at_place(known, before, apart)
+    inside = first_at_place(new.occupied, earlier.occupied, apart)
+    repeated = int((~fresh).sum() + (~inside).sum())
+    count = len(fresh) + len(inside)
+    if repeated == 0:
+        return new, []
+    kept = KnownPoints(
+        free=new.free,
+        occupied=new.occupied[inside],
+        known=new.known[fresh],
+        known_sdf=new.sdf[fresh],
+    )
+    if repeated <= MANY_REPEATED * count:
+        return kept, []
+    text = (
+        f"{repeated} of {count} points are within {1000.0 * apart:.2g} mm of an "
+        "earlier one; a place that is measured again counts once"
+    )
+    return kept, [PointsWarning("repeated", text)]
+
+
+def away_from(points: FloatArray, earlier: FloatArray, apart: float) -> BoolArray:
+    """Which points (N, k) are farther than `apart` from all earlier ones (M, k)."""
+    from scipy.spatial import cKDTree
+
+    if len(points) == 0 or len(earlier) == 0:
+        return np.ones(len(points), dtype=bool)
+    return np.asarray(cKDTree(earlier).query(points)[0] > apart)
+
+
+def first_at_place(points: FloatArray, earlier: FloatArray, apart: float) -> BoolArray:
+    """Which points (N, k) are farther than `apart` from all earlier ones (M, k) and kept ones."""
+    from scipy.spatial import cKDTree
+
+    first = away_from(points, earlier, apart)
+    left = np.flatnonzero(first)
+    left = left[np.sort(np.unique(points[left], axis=0, return_index=True)[1])]
+    first[:] = False
+    first[left] = True
+    if len(left) < 2:
+        return first
+    tree = cKDTree(points[left])
+    beside = tree.query(points[left], k=2)[0][:, 1] <= apart
+    for n in np.flatnonzero(beside):
+        if first[left[n]]:
+            first[left[tree.query_ball_point(points[left[n]], apart)]] = False
+            first[left[n]] = True
+    return first
 
 
 @dataclass(frozen=True)

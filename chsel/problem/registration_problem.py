@@ -12,7 +12,7 @@ import numpy as np
 from chsel.errors import PoseError, SettingError, require_between, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, ShapesShown, digest, frozen
 from chsel.problem.points import KnownPoints, Workspace, require_parts
-from chsel.problem.poses import check_rigid
+from chsel.problem.poses import check_rigid, inverse
 from chsel.problem.pushes import Pushes
 from chsel.problem.sdf_grid import COARSEST, FINEST, SdfGrid
 from chsel.problem.streams import StreamKey
@@ -169,6 +169,11 @@ class Hypotheses:
         best = f", best cost {self.cost[0]:.4g}" if len(self.cost) else ""
         judged = "" if self.trust is None else f", {self.trust}"
         return f"<Hypotheses: {len(self.cost)}, {self.distinct} distinct{best}{judged}>"
+
+    @cached_property
+    def world_from_object(self) -> FloatArray:
+        """The poses (B, 4, 4) the other way round: where the object is in the world."""
+        return inverse(self.object_from_world)
 
     @property
     def distinct(self) -> int:

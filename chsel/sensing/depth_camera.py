@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isqrt, sqrt
+from math import hypot, isqrt, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,12 +12,21 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from chsel.errors import PointsError, PoseError, SettingError, require_positive
+from chsel.errors import (
+    InputWarning,
+    PointsError,
+    PoseError,
+    SettingError,
+    quoted,
+    require_at_most,
+    require_positive,
+)
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, frozen
-from chsel.problem.points import Lattice
+from chsel.problem.points import FARTHEST_PLACE, Lattice
 from chsel.problem.poses import apply, nearest_rigid
 
 MOST_PIXELS = 100_000  # on a side
+MOST_FOCUS = 1e6  # pixels: focal lengths, and coordinates of the principal point
 _STEEPEST = 4.0  # tangent of the angle between a surface's normal and the ray: 76 degrees
 _SPACINGS = 4.0  # random points on a surface are one region up to so many typical distances
 _MOST_ASKED = 2000  # points whose nearest neighbours give the typical distance
@@ -26,6 +35,8 @@ _REGION_JUMP = 0.01  # share of the depth: the same within a mask
 _PART = 0.05  # of the largest region of a mask: smaller ones are left out
 _OUTLINE = 2  # pixels by which a mask may be off
 _FARTHEST = 20.0  # m: of what a camera sees nearest
+_MATRIX_ROUNDING = 1e-6  # of the focal length
+_OFF_CENTRE = 0.05  # of the longer side: principal points are nearer to the centre
 
 
 @dataclass(frozen=True)
@@ -50,8 +61,45 @@ class PinholeCamera:
                 )
         require_positive("camera fx", self.fx)
         require_positive("camera fy", self.fy)
-        if not np.isfinite([self.cx, self.cy]).all():
-            raise SettingError(f"camera cx, cy are {self.cx}, {self.cy}; accepted: finite numbers")
+        require_at_most("camera fx", self.fx, MOST_FOCUS)
+        require_at_most("camera fy", self.fy, MOST_FOCUS)
+        if not (np.abs([self.cx, self.cy]) <= MOST_FOCUS).all():
+            raise SettingError(
+                f"camera cx, cy are {self.cx}, {self.cy}; accepted: finite numbers up to "
+                f"{MOST_FOCUS:_} (pixels)"
+            )
+
+    @classmethod
+    def of_matrix(cls, matrix: Any, width: int, height: int) -> PinholeCamera:
+        """The camera of a matrix (3, 3). Raises SettingError for one that is not a pinhole's."""
+        matrix = frozen("camera", matrix, (3, 3), error=SettingError)
+        fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        off = matrix - np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        if np.abs(off).max() > _MATRIX_ROUNDING * max(abs(fx), 1.0):
+            raise SettingError(
+                f"camera is {quoted(matrix.tolist())}, not a pinhole camera's matrix; accepted: "
+                "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] by rows, pixels"
+            )
+        return cls(width, height, fx, fy, cx, cy)
+
+    def check_centre(self) -> list[InputWarning]:
+        """A warning if the principal point is likely that of another image, or cx and cy swapped.
+
+        That is, outside of the image, or far from its centre and much nearer to it when swapped.
+        """
+        middle_x, middle_y = 0.5 * (self.width - 1), 0.5 * (self.height - 1)
+        away = hypot(self.cx - middle_x, self.cy - middle_y)
+        swapped = hypot(self.cy - middle_x, self.cx - middle_y)
+        inside = 0.0 <= self.cx <= self.width and 0.0 <= self.cy <= self.height
+        off_centre = away > _OFF_CENTRE * max(self.width, self.height)
+        if inside and not (off_centre and 2.0 * swapped < away):
+            return []
+        what = "" if inside else ", outside of the image"
+        text = (
+            f"camera has cx, cy = {self.cx:g}, {self.cy:g}{what}, for {self.width} x "
+            f"{self.height} pixels (width x height); check that they are of this image, not swapped"
+        )
+        return [InputWarning("principal_point", text)]
 
     @property
     def columns(self) -> FloatArray:
@@ -244,7 +292,9 @@ def depth_look(
     at most, metres. Pixels beside jumps of depth, at the mask's outline and in its small regions
     are left out. Raises PointsError for an image without a depth, or a mask without a pixel left.
     """
-    pose = frozen("world_from_camera", world_from_camera, (4, 4), error=PoseError)
+    pose = frozen(
+        "world_from_camera", world_from_camera, (4, 4), error=PoseError, most=FARTHEST_PLACE
+    )
     pose = nearest_rigid("world_from_camera", pose[None])[0]
     valid = valid_pixels(camera.image("depth", depth), nearest=0.0, furthest=np.inf)
     if not valid.any():
@@ -264,6 +314,11 @@ def depth_look(
             raise PointsError(
                 f"none of the {int(mask.sum())} pixels of mask is on a surface; accepted: a mask "
                 "with pixels of a measured depth, inside of its outline"
+            )
+        if (away := float(np.median(depth[on_object]))) > _FARTHEST:
+            raise PointsError(
+                f"what mask shows is {away:g} m away: millimetres, or a mask beside the object? "
+                "accepted: metres"
             )
         surface = one_per_voxel(apply(pose, camera.back_project(depth)[on_object]), side)
         rays &= on_object | ~mask

@@ -23,7 +23,6 @@ RECOVERED = "recovered: "
 
 _ENDS = ("finished", "interrupted")
 _FAILED = "failed: "
-_LONGEST_FOCUS = 1e6  # pixels
 _ROUNDING = 1e-6  # of a sum of weights
 _BEFORE_ALL_STEPS = -1
 
@@ -135,10 +134,12 @@ def voxel_side(field: str, value: float) -> None:
 
 def intrinsics(field: str, value: np.ndarray) -> None:
     """Focal lengths and centre (4,) of a camera, pixels."""
-    if not (np.abs(value) <= _LONGEST_FOCUS).all() or not (value[:2] > 0.0).all():
+    from chsel.sensing.depth_camera import MOST_FOCUS
+
+    if not (np.abs(value) <= MOST_FOCUS).all() or not (value[:2] > 0.0).all():
         raise RecordingError(
             f"{field} are {value.tolist()}; accepted: focal lengths above 0, all up to "
-            f"{_LONGEST_FOCUS:g} (pixels)"
+            f"{MOST_FOCUS:g} (pixels)"
         )
 
 

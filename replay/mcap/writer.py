@@ -81,6 +81,16 @@ class McapRecorder(Recorder):
             )
             self._writer.start(profile=PROFILE, library=_LIBRARY)
 
+    def check(self, event: Event) -> None:
+        """Raise RecordingError for values that `record` refuses."""
+        match event:
+            case Logged():
+                log_line(event.level, event.text, 0)
+            case HypothesesFound():
+                check_message(RECORDS[event.topic], self._hypotheses_values(event))
+            case _:
+                check_message(RECORDS[event.topic], event_values(event))
+
     def record(self, event: Event) -> None:
         """Write one event: its messages, then those for viewers."""
         if self._closed:
@@ -207,17 +217,21 @@ class McapRecorder(Recorder):
 
     def _write_hypotheses(self, event: HypothesesFound) -> None:
         found, last = event.hypotheses, self._last_snapshot
-        archive, repeats = None, False
-        if (final := found.archive) is not None:
-            repeats = last is not None and _same(last, SnapshotTaken(event.step, final))
-            archive = archive_values(event.step, final)
-        values = shared_values("Hypotheses", found) | {
-            "step": event.step,
-            "archive": None if repeats else archive,
-            "archive_is_last_snapshot": repeats,
-        }
+        values = self._hypotheses_values(event)
+        archive, repeats = values["archive"], False
+        if found.archive is not None:
+            repeats = last is not None and _same(last, SnapshotTaken(event.step, found.archive))
+        values |= {"archive": None if repeats else archive, "archive_is_last_snapshot": repeats}
         self._record(event.topic, event.step, values, archive=archive)
         self._last_elites = found.elites
+
+    def _hypotheses_values(self, event: HypothesesFound) -> dict[str, Any]:
+        """The message `Hypotheses` with its archive."""
+        found = event.hypotheses
+        archive = None if found.archive is None else archive_values(event.step, found.archive)
+        values = shared_values("Hypotheses", found)
+        values |= {"step": event.step, "archive": archive, "archive_is_last_snapshot": False}
+        return values
 
     def _record(self, topic: str, step: int, values: dict[str, Any], **repeated: Any) -> None:
         """Write a message of the project's own.

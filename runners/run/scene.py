@@ -77,7 +77,7 @@ class Scene:
     mesh: trimesh.Trimesh
     sdf: SdfGrid
     start: Start
-    warnings: tuple[InputWarning, ...] = ()  # about the object
+    warnings: tuple[InputWarning, ...] = ()  # about the object and a file of points
     steering: Steering | None = None  # chooses the probes; None for the session's own order
 
     @property
@@ -121,6 +121,7 @@ def open_scene(config: ProbeConfig) -> Scene:
         session = open_session(kind, settings, model, config.seed)
         name, mesh, sdf = model.name, model.mesh, model.grid(settings)
         start = Start(settings.start_contacts, settings.start_probe)
+        found += getattr(session, "warnings", [])
         if kind in _OF_REAL_OBJECTS:
             found += check_size(model, session.workspace)
     if policy_name == GRID:

@@ -26,8 +26,13 @@ from chsel.problem.points import (
     FREE_RESOLUTION,
     KnownPoints,
     Workspace,
+    check_places,
     check_points,
+    check_workspace,
+    distinct_points,
+    same_place,
     workspace_around,
+    world_points,
 )
 from chsel.problem.poses import nearest_rigid
 from chsel.problem.sdf_grid import OBJECT_PADDING
@@ -72,22 +77,32 @@ class PointsSession:
         self.world_from_object = self._file.world_from_object
         self.initial_points = KnownPoints()
         self.count = len(self._steps)
-        every = KnownPoints.joined([self._file.at(step) for step in self._steps])
+        self.warnings: list[PointsWarning] = []  # about the file
+        self._points: list[KnownPoints] = []  # of each step
+        every = KnownPoints()
+        diameter = object_model.diameter
+        for step in self._steps:
+            points, repeated = distinct_points(self._file.at(step), every, same_place(diameter))
+            every = every.merged(points)
+            self._points.append(points)
+            self.warnings += repeated
         given = None
         if settings.workspace is not None:
             (x0, x1), (y0, y1), (z0, z1) = settings.workspace
             given = Workspace((x0, y0, z0), (x1, y1, z1))
         try:  # before any work; warnings are given when the points become known
-            check_points(every, object_model.diameter, self.free_resolution, given)
+            check_points(every, diameter, self.free_resolution, given)
+            if given is not None:
+                self.warnings += check_workspace(given, diameter)
         except PointsError as error:
             raise PointsError(f"point file {settings.path}: {error}") from None
+        self.warnings += check_places("the nearest point", every.all_points(), diameter, given)
         self.workspace = given or workspace_around(every, object_model.grid(settings))
 
     def probes(self) -> Iterator[Probe]:
         """One probe per step of the file."""
-        for step in self._steps:
-            points = self._file.at(step)
-            contacts = points.contacts
+        for step, points in zip(self._steps, self._points, strict=True):
+            contacts = self._file.at(step).contacts
             yield Probe(step, "points", points, contacts=contacts, contact_normals=0.0 * contacts)
 
     def close(self) -> None:
@@ -137,6 +152,7 @@ def read_points(path: str | Path) -> PointFile:
         content = reader(path)
         if len(content.points) == 0:
             raise PointsError("it holds no points; accepted: at least one")
+        world_points("points", content.points)  # raises for what is far beyond a robot's reach
         first, last = content.steps.min(), content.steps.max()
         if first < 0 or last > LAST_STEP:
             raise PointsError(f"steps are from {first} to {last}; accepted: 0 to {LAST_STEP}")

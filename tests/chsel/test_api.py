@@ -32,6 +32,14 @@ def test_a_mesh_and_points_are_all_it_takes():
     assert np.abs(best[:3, 3] - POSE[:3, 3]).max() < 0.005
 
 
+def test_contacts_are_points_on_the_surface_and_have_a_name():
+    expected = register(surface=SURFACE)
+    assert register(contacts=SURFACE).digest == expected.digest
+    np.testing.assert_array_equal(expected.world_from_object, inverse(expected.object_from_world))
+    with pytest.raises(chsel.ChselError, match=r"accepted: chsel\.register\(mesh, contacts=points"):
+        chsel.register(BOX, SURFACE)
+
+
 def test_a_grid_that_is_kept_a_mesh_lists_and_tensors_give_the_same_bits(monkeypatch):
     grid = chsel.SdfGrid.from_mesh(BOX, 0.002)
     digest = register(surface=SURFACE).digest
@@ -86,6 +94,8 @@ AWAY = chsel.SdfGrid.from_mesh(BOX, 0.005, padding=0.5).at(apply(inverse(POSE), 
 FREE = FREE[AWAY > 0.005]
 NOISE = np.random.default_rng(0).normal(0.0, 0.004, SURFACE.shape)
 ANCHORED = {"method": "anchored", "settings": {"size": "small", "noise": 0.0001}}
+HALL = chsel.Workspace((-400, -400, -200), (400, 400, 200))
+STARTS = inverse(compose(POSE[None, :3, :3], 1000.0 * POSE[None, :3, 3]))
 ASIDE = chsel.Workspace((0.38, 0, 0), (0.6, 0.3, 0.3))
 
 
@@ -97,6 +107,10 @@ ASIDE = chsel.Workspace((0.38, 0, 0), (0.6, 0.3, 0.3))
         ({"surface": SURFACE, "workspace": ASIDE}, "contacts_outside"),
         ({"surface": np.concatenate([SURFACE, [[3.0, 0, 0]]])}, "contacts_apart"),
         ({"surface": SURFACE, "free": FREE + 5.0}, "contacts_far_from_free"),
+        ({"surface": SURFACE, "workspace": HALL}, "wide_workspace"),
+        ({"surface": np.repeat(SURFACE, 2, axis=0)}, "repeated"),
+        ({"surface": 400.0 * POSE[None, :3, 3]}, "far_away"),
+        ({"surface": SURFACE, "initial_set": STARTS}, "far_away"),
         ({"surface": 3.0 * SURFACE}, "no_fit"),
         ({"surface": SURFACE + NOISE, **ANCHORED}, "above_noise"),
     ],
@@ -123,8 +137,14 @@ def test_points_far_off_all_poses_give_one_warning():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({}, "no point was given; accepted: surface, free"),
+        ({}, "no point was given; accepted: contacts, free"),
         ({"surface": 1000.0 * SURFACE}, r"the object is 0\.1.* m: are they in mill"),
+        ({"contacts": POINT, "surface": POINT}, "contacts and surface are two names of the same"),
+        ({"contacts": [[1e17, 0, 0]]}, r"contacts\[0\] has 1e\+17; accepted: up to 100000"),
+        ({"free": [[1e8, 0, 0]]}, r"free\[0\] has 1e\+08; accepted: up to 100000"),
+        ({"workspace": chsel.Workspace((0, 0, 0), (1e8, 1, 1))}, r"workspace\[1\] has 1e\+08"),
+        ({"contacts": np.ma.masked_array(SURFACE, SURFACE > 0)}, "contacts has masked values"),
+        ({"settings": {"noise": 0.5}, "method": None}, "noise is 0.5 m, and the object is 0.12"),
         ({"known": POINT}, "known_sdf has 0 entries; accepted: one per known point, 1"),
         ({"method": "magic"}, "method is 'magic'; accepted: chsel"),
         ({"method": "anchored"}, "method=anchored: settings"),
@@ -140,7 +160,7 @@ def test_points_far_off_all_poses_give_one_warning():
     ],
 )
 def test_mistakes_say_what_is_accepted(arguments, message):
-    if arguments and not {"surface", "free", "known"} & set(arguments):
+    if arguments and not {"contacts", "surface", "free", "known"} & set(arguments):
         arguments = {"surface": POINT, **arguments}
     with pytest.raises(chsel.ChselError, match=message) as caught:
         register(**arguments)
@@ -228,5 +248,5 @@ def test_the_examples_of_the_library_run(tmp_path):
         (example,) = re.findall(rf"```python\n({start}.*?)```", page, re.DOTALL)
         exec(example.replace('"drill.obj"', repr(str(tmp_path / "drill.obj"))), names)
     assert names["trust"].verdict == "determined"
-    assert np.abs(inverse(names["best"])[:3, 3] - POSE[:3, 3]).max() < 0.005
+    assert np.abs(names["best"][:3, 3] - POSE[:3, 3]).max() < 0.005
     assert float(names["translation"].grad.abs().sum()) > 0.0

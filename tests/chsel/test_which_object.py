@@ -34,6 +34,31 @@ def test_the_true_object_comes_first(tmp_path):
     assert read_recording(tmp_path / "again_slim.mcap").ended.outcome.startswith("failed")
 
 
+def test_what_one_object_cannot_have_is_added_to_none():
+    """Contacts 21 m apart, which are never those of the smaller object: its diameter is 0.2 m."""
+    small, large = BOX.copy(), BOX.copy().apply_scale(2.0)
+    size = float(np.linalg.norm(small.extents))
+    with chsel.WhichObject({"large": large, "small": small}, workspace=WORKSPACE) as which:
+        which.add(contacts=apply(TRUTH, on_faces(12)))
+        spread = np.array([[0.0, 0.0, 0.0], [110.0 * size, 0.0, 0.0]]).repeat(30, axis=0)
+        jitter = np.random.default_rng(0).uniform(0.0, 0.2, spread.shape)
+        with pytest.raises(chsel.ChselError, match="millimetres"):
+            which.add(contacts=spread + jitter)
+        counts = [len(session.online.points.known) for session in which.sessions.values()]
+        assert counts == [12, 12]
+        assert {session.step for session in which.sessions.values()} == {0}
+
+
+def test_objects_of_other_sizes_are_compared_by_the_same_points():
+    small, large = BOX.copy().apply_scale(0.2), BOX
+    contacts = apply(TRUTH, on_faces(12))
+    near = np.concatenate([contacts, contacts + np.array([0.0, 0.0, 0.0025])])
+    with chsel.WhichObject({"large": large, "small": small}) as which:
+        which.add(contacts=near)
+        digests = {session.online.points.digest for session in which.sessions.values()}
+    assert len(digests) == 1
+
+
 def test_no_action_is_chosen_by_two_objects():
     meshes = {"slim": trimesh.creation.box(BOX_SIDES * [1.0, 0.5, 1.0]), "box": BOX}
     contacts = apply(TRUTH, on_faces(12))

@@ -214,7 +214,7 @@ def test_an_object_that_comes_into_free_space_from_outside_misses_none_of_its_po
     case = Case("box", points, CostSettings(penetration_tolerance=0.0), 0.005, vectors)
     for rate in (0.002, 0.005):
         plain = descends_plainly(case, 1.0, rate, 20)
-    free_alone = replace(case, points=KnownPoints(free)).objective("none")
+    free_alone = replace(case, points=KnownPoints(free=free)).objective("none")
     assert not free_alone.costs(vectors)[1:].any()
     assert (free_alone.costs(plain) > 0.0).sum() > 5
 
@@ -237,7 +237,9 @@ def test_200_000_free_points_cost_to_the_bit_what_they_cost_without_culling(free
     transforms = random_poses(np.random.default_rng(4), 5, 0.2)
     transforms[0] = np.eye(4)
     poses = Poses.of(transforms)
-    case = Case("l_shape", KnownPoints(free), CostSettings(lookup=lookup), 0.005, posed(transforms))
+    case = Case(
+        "l_shape", KnownPoints(free=free), CostSettings(lookup=lookup), 0.005, posed(transforms)
+    )
     costs = case.cost().costs(poses)
     assert costs[0] > 1.0
     assert_same_bits(costs, case.cost(culling="none").costs(poses))
@@ -273,7 +275,11 @@ def test_points_on_borders_of_voxels_and_of_the_grid_read_what_the_torch_cost_re
     for n in range(len(shifts)):
         # exact but for the numbers next to others
         world = (border_points(sdf) - shifts[n]) @ turns[n]
-        for points in (KnownPoints(world), KnownPoints(occupied=world), KnownPoints(known=world)):
+        for points in (
+            KnownPoints(free=world),
+            KnownPoints(occupied=world),
+            KnownPoints(known=world),
+        ):
             one = vectors[n : n + 1].copy()
             assert_equals_torch(Case("dyadic", points, changes, sdf.resolution, one))
 
@@ -284,7 +290,7 @@ def test_free_voxels_are_read_on_their_borders_as_the_torch_cost_reads_them():
     changes = CostSettings(free_term="interior", interior_spacing=0.5 * step)
     shifts = step * np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.25], [1.5, -1.0, 2.5]])
     vectors = posed(compose(np.tile(np.eye(3), (3, 1, 1)), shifts))
-    case = Case("dyadic", KnownPoints(free), changes, step, vectors)
+    case = Case("dyadic", KnownPoints(free=free), changes, step, vectors)
     assert case.objective().costs(vectors)[0] > 0.0
     assert_equals_torch(case)
 
@@ -340,7 +346,7 @@ def test_tolerance_deeper_than_the_object_is_a_warning_and_costs_free_points_not
     changes = CostSettings(penetration_tolerance=-0.2)
     free = np.random.default_rng(12).uniform(-0.05, 0.05, (100, 3))
     with pytest.warns(UserWarning, match="cannot be violated"):
-        cost = made(grid_of("box"), KnownPoints(free), changes)
+        cost = made(grid_of("box"), KnownPoints(free=free), changes)
     assert cost.evaluate(np.eye(4)[None])[0] == 0.0
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -350,11 +356,11 @@ def test_tolerance_deeper_than_the_object_is_a_warning_and_costs_free_points_not
 @pytest.mark.filterwarnings("ignore:.*cannot be violated")
 @pytest.mark.parametrize("made", [CompiledCost, RelaxedCost])
 def test_what_has_no_cost_says_what_is_accepted(made):
-    sdf, free = grid_of("box"), KnownPoints([[0.0, 0.0, 0.0]])
+    sdf, free = grid_of("box"), KnownPoints(free=[[0.0, 0.0, 0.0]])
     interior = CostSettings(free_term="interior")
     with pytest.raises(SettingError, match="penetration_tolerance nearer to 0"):
         made(sdf, free, replace(interior, penetration_tolerance=-0.2))
     with pytest.raises(SettingError, match="coarser free_resolution"):
-        made(sdf, KnownPoints([[0.0, 0.0, 0.0], [1e9, 1e9, 1e9]]), interior)
+        made(sdf, KnownPoints(free=[[0.0, 0.0, 0.0], [1e9, 1e9, 1e9]]), interior)
     with pytest.raises(PoseError, match=r"has shape \(4, 4\); accepted: \(any, 4, 4\)"):
         made(sdf, free).evaluate(np.eye(4))

@@ -13,6 +13,9 @@ from chsel.problem.points import (
     Workspace,
     check_contacts,
     check_points,
+    distinct_points,
+    first_at_place,
+    same_place,
 )
 
 
@@ -44,6 +47,48 @@ def test_tensors_are_taken():
 def test_malformed_points_are_named(arrays, message):
     with pytest.raises(PointsError, match=message):
         KnownPoints(**arrays)
+
+
+def test_points_without_a_name_and_a_workspace_of_one_corner_are_refused():
+    with pytest.raises(PointsError, match=r"no name; accepted: KnownPoints\(free=..., known=...\)"):
+        KnownPoints(np.zeros((2, 3)))
+    for corners in ([[0, 1], [0, 1], [0, 1]], (0, 0, 0)):
+        with pytest.raises(PointsError, match=r"accepted: chsel\.Workspace\(lower, upper\)"):
+            Workspace(corners)
+
+
+def test_points_at_a_place_that_was_measured_count_once():
+    """Against all pairs, one after the other; also across the borders of any voxels."""
+    stream = np.random.default_rng(0)
+    for side in (0.005, 0.02, 0.2):
+        points, earlier = stream.uniform(0.0, side, (200, 3)), stream.uniform(0.0, side, (5, 3))
+        kept = [*earlier]
+        expected = []
+        for point in points:
+            expected.append(min(np.linalg.norm(point - other) for other in kept) > 0.003)
+            kept += [point] if expected[-1] else []
+        assert first_at_place(points, earlier, 0.003).tolist() == expected
+        new, before = KnownPoints(known=points, occupied=points), KnownPoints(known=earlier)
+        distinct, _ = distinct_points(new, before, 0.003)
+        np.testing.assert_array_equal(distinct.known, points[expected])
+        assert len(distinct.occupied) >= len(distinct.known)
+    held = np.zeros((100_000, 3))
+    held[:3] = [[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]
+    assert np.flatnonzero(first_at_place(held, held[:0], 0.003)).tolist() == [0, 1, 2]
+
+
+def test_known_points_of_other_distances_are_other_points_and_free_ones_stay():
+    points = KnownPoints(free=np.zeros((5, 3)), known=np.zeros((3, 3)), known_sdf=[0.0, 0.02, 0.0])
+    distinct, warnings = distinct_points(points, KnownPoints(), 0.003)
+    assert distinct.sdf.tolist() == [0.0, 0.02]
+    assert len(distinct.free) == 5
+    (warning,) = warnings
+    assert warning.text.startswith("1 of 3 points are within 3 mm of an earlier one; a place")
+    scan = KnownPoints(known=np.linspace([0, 0, 0], [0.1, 0, 0], 30))
+    close = scan.merged(KnownPoints(known=[[0.0001, 0, 0]]))
+    distinct, warnings = distinct_points(close, KnownPoints(), 0.003)
+    assert (distinct.digest, warnings) == (scan.digest, [])  # so few are no warning
+    assert [same_place(size) for size in (1.0, 0.04)] == [0.003, 0.002]
 
 
 def test_merging_appends_class_by_class_and_changes_the_digest():

@@ -55,6 +55,28 @@ def test_steps_make_a_sequence_and_all_classes_arrive_at_theirs(tmp_path):
     assert len(last.contacts) == 3
 
 
+def test_a_place_that_is_measured_again_counts_once_also_at_a_later_step(tmp_path):
+    held = np.repeat(SURFACE[:1], 30, axis=0)
+    path = npz(
+        tmp_path,
+        surface=np.concatenate([SURFACE, held + 0.001]),
+        surface_step=np.array([0, 0, 0, *range(30)]),
+    )
+    session = PointsSession(PointsSettings(str(path)), BOX)
+    probes = list(session.probes())
+    known = np.concatenate([probe.new_points.known for probe in probes])
+    np.testing.assert_array_equal(known, SURFACE)
+    assert [len(probe.contacts) for probe in probes] == [4, *[1] * 29]
+    assert {warning.code for warning in session.warnings} == {"repeated"}
+
+
+def test_points_in_millimetres_are_a_warning_and_those_out_of_reach_an_error(tmp_path):
+    session = PointsSession(PointsSettings(str(npz(tmp_path, surface=[[400.0, 0, 0]]))), BOX)
+    assert [warning.code for warning in session.warnings] == ["far_away"]
+    with pytest.raises(PointsError, match=r"points.npz: points\[0\] has 1e\+08; accepted: up to"):
+        read_points(npz(tmp_path, surface=[[1e8, 0, 0]]))
+
+
 def test_csv_holds_every_kind_and_points_without_a_step_are_known_first(tmp_path):
     rows = "x, y, z, kind, sdf, step\n0,0,0,surface,,0\n0.1,1e-1,.7,free,,\n"
     rows += "0,1,0, known ,-0.02,1\n2,2,2,occupied,, 1\n3,3,3,free,, \n"
