@@ -16,10 +16,12 @@ _NANOSECONDS = 1e9
 _NOISE = np.array([0.02, 0.1])  # m, rad: a pose may be off by this in no time at all
 _STEP = np.array([0.01, 0.05])  # m, rad: shorter ways there and back do not matter
 _BACK = 0.25  # of the way there: a sample is back where it was if it is nearer
+_BRISK = 500.0  # steps / s^2: the same again and again at 10 m/s^2 or 50 rad/s^2
 _SUDDEN = 2500.0  # steps / s^2: there and back at 50 m/s^2 or 250 rad/s^2, beyond any arm
 _WINDOW, _OFTEN = 16, 5  # so often there and back in so many samples are two publishers
 _MOST_TRACKS = 8  # that a sample may continue, those of late
 _OUTLIERS = 1 / 3  # of the samples of a motion beside it: fewer are outliers, not a publisher
+_MANY = 0.1  # of all samples: more outliers may be of another publisher
 _SHORT = 0.05  # of the samples of the longest motion: fewer at an end of the log are outliers
 
 
@@ -47,9 +49,10 @@ class CheckedMotion:
         """Say what was left out. name: of what moves."""
         jumps, outliers = int(self.jumps.sum()), int(self.outliers.sum())
         disputed = int(self.disputed.sum())
+        many = ", perhaps those of a second publisher" if outliers > _MANY * len(self.kept) else ""
         texts = {
             f"{name} goes there and back faster than {limits}: {outliers} of "
-            f"{len(self.kept)} samples are left out": outliers,
+            f"{len(self.kept)} samples are left out{many}": outliers,
             f"{name} alternates between places that are too far apart, as if two publishers sent "
             f"it: {disputed} of {len(self.kept)} samples are left out; record one of them, or "
             "raise max_speed and max_turn of the rig": disputed,
@@ -70,20 +73,25 @@ def check_motion(
     times (N,): nanoseconds, ascending. blank (N,): samples that a tracker sends without a target;
     they are outliers if the motion jumps to or from them.
     """
-    count = len(times)
-    outliers, disputed = _there_and_back(times, distances)
+    outliers = np.zeros(len(times), dtype=bool)
+    every = np.arange(len(times))
+    if blank is not None and not _reachable(times, distances, every[:-1], every[1:], limits).all():
+        outliers |= blank
+    left = np.flatnonzero(~outliers)
+    alone, disputed = np.zeros((2, len(times)), dtype=bool)
+    alone[left], disputed[left] = _there_and_back(times, distances, left)
+    outliers |= alone
     left = np.flatnonzero(~outliers & ~disputed)
     too_fast = ~_reachable(times, distances, left[:-1], left[1:], limits)
     if too_fast.any():
         starts = np.flatnonzero(np.append(True, too_fast))
         tracks = _tracks(times, distances, left, starts, limits)
-        lost = np.zeros(len(left), bool) if blank is None else blank[left]
-        _choose(tracks, left, lost, outliers, disputed)
+        _choose(tracks, distances, left, outliers, disputed)
     kept = ~outliers & ~disputed
-    jumps = np.zeros(count, dtype=bool)
     chosen = np.flatnonzero(kept)
     between = np.cumsum(disputed)[chosen]
     breaks = ~_reachable(times, distances, chosen[:-1], chosen[1:], limits)
+    jumps = np.zeros(len(times), dtype=bool)
     jumps[chosen[1:]] = breaks | (np.diff(between) > 0)
     return CheckedMotion(kept, jumps, outliers, disputed)
 
@@ -98,22 +106,31 @@ def _reachable(
     return possible
 
 
-def _there_and_back(times: IntArray, distances: Distances) -> tuple[BoolArray, BoolArray]:
-    """Single samples (N,) off the way of their neighbours, and (N,) motions that alternate."""
-    outliers, disputed = np.zeros((2, len(times)), dtype=bool)
-    if len(times) < 3:
+def _there_and_back(
+    times: IntArray, distances: Distances, left: IntArray
+) -> tuple[BoolArray, BoolArray]:
+    """Which of samples `left` (L,) are off the way of their neighbours; and which alternate."""
+    outliers, disputed = np.zeros((2, len(left)), dtype=bool)
+    if len(left) < 3:
         return outliers, disputed
-    index, seconds = np.arange(len(times)), np.diff(times) / _NANOSECONDS
-    steps = (distances(index[:-1], index[1:]) / _STEP).max(axis=1)
-    across = (distances(index[:-2], index[2:]) / _STEP).max(axis=1)
+    seconds = np.diff(times[left]) / _NANOSECONDS
+    steps = (distances(left[:-1], left[1:]) / _STEP).max(axis=1)
     least = np.minimum(steps[:-1], steps[1:])
-    back = (least > 1.0) & (across < _BACK * least)
-    often = np.convolve(back, np.ones(_WINDOW))[: len(back)] >= _OFTEN  # in the window up to here
+    back = (least > 1.0) & _is_back(distances, left[:-2], left[2:], least)
+    squared = seconds[:-1] * seconds[1:]
+    often = np.convolve(back & (least > _BRISK * squared), np.ones(_WINDOW))[: len(back)] >= _OFTEN
     for last in np.flatnonzero(often):
         disputed[max(last + 2 - _WINDOW, 0) : last + 3] = True
-    outliers[1:-1] = back & (least > _SUDDEN * seconds[:-1] * seconds[1:])
-    outliers &= ~disputed
-    return outliers, disputed
+    outliers[1:-1] = back & (least > _SUDDEN * squared)
+    return outliers & ~disputed, disputed
+
+
+def _is_back(
+    distances: Distances, before: IntArray, after: IntArray, steps: FloatArray
+) -> BoolArray:
+    """Whether (N,) samples are where earlier ones were, by the lengths of the ways between."""
+    back: BoolArray = (distances(before, after) / _STEP).max(axis=1) < _BACK * steps
+    return back
 
 
 def _tracks(
@@ -142,30 +159,32 @@ def _tracks(
 
 
 def _choose(
-    tracks: IntArray, left: IntArray, blank: BoolArray, outliers: BoolArray, disputed: BoolArray
+    tracks: IntArray,
+    distances: Distances,
+    left: IntArray,
+    outliers: BoolArray,
+    disputed: BoolArray,
 ) -> None:
     """Mark what is left out of samples `left` (L,) of several motions, by their numbers (L,)."""
-    outliers[left[blank]] = True
-    sizes = np.bincount(tracks, ~blank)
+    sizes = np.bincount(tracks)
     longest = int(sizes.argmax())
-    accepted = (tracks == longest) & ~blank
-    for number in np.argsort(-sizes, kind="stable").tolist():
-        own = np.flatnonzero((tracks == number) & ~blank)
-        if number == longest or len(own) == 0:
-            continue
-        ends = np.flatnonzero(accepted)[[0, -1]]
-        within = own[(own > ends[0]) & (own < ends[1])]
-        among = int(accepted[own[0] : own[-1]].sum())
+    accepted = tracks == longest
+    for number in np.argsort(-sizes, kind="stable").tolist()[1:]:
+        own, others = np.flatnonzero(tracks == number), np.flatnonzero(accepted)
+        within = own[(own > others[0]) & (own < others[-1])]
+        among = others[(others > own[0]) & (others < own[-1])]
         if len(within) == 0:
             leave_out = len(own) < _SHORT * sizes[longest]
-        elif among == 0:
-            before = tracks[np.flatnonzero(accepted[: own[0]])[-1]]
-            after = tracks[own[-1] + np.flatnonzero(accepted[own[-1] :])[0]]
-            leave_out = before == after
+        elif len(among) == 0:
+            # It left a place, and comes back to it.
+            place = int(np.searchsorted(others, own[0]))
+            way = left[[others[place - 1], own[0], own[-1], others[place]]]
+            steps = (distances(way[:-1:2], way[1::2]) / _STEP).max(axis=1)
+            leave_out = bool(_is_back(distances, way[:1], way[-1:], steps.min(keepdims=True))[0])
         else:
-            leave_out = len(within) < _OUTLIERS * among
+            leave_out = len(within) < _OUTLIERS * len(among)
             if not leave_out:
-                common = slice(max(own[0], ends[0]), min(own[-1], ends[1]) + 1)
+                common = slice(max(own[0], others[0]), min(own[-1], others[-1]) + 1)
                 disputed[left[common]] = ~outliers[left[common]]
         if leave_out:
             outliers[left[own]] = True

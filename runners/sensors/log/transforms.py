@@ -114,7 +114,7 @@ class TransformTree:
             child, edge = next(one for one in edges if not one[1].at(stamps, gap_s)[1][0])
             if len(edge.times) == 0:
                 raise TransformError(
-                    f"{target} from {source}: of {child} in {edge.parent} all samples are left out"
+                    f"{target} from {source}: no sample is left: {'; '.join(edge.remarks)}"
                 )
             away = edge.nearest(stamp_ns)
             raise TransformError(
@@ -189,6 +189,7 @@ class _Edge:
         self._contradicting: tuple[IntArray, FloatArray, FloatArray] | None = None
         """Times, positions and quaternions of other poses at times (C,) of samples."""
 
+        self.remarks: list[str] = []  # on samples that are left out
         self._topics: tuple[str, ...] = ()
         self._static: tuple[int, FloatArray] | None = None  # stamp, pose
         self._added: dict[str, tuple[array[int], array[int], array[float]]] = {}
@@ -254,6 +255,7 @@ class _Edge:
         found = check_motion(times, distances, limits, blank)
         topics = " and ".join(self._topics)
         remarks = found.remarks(f"{child} in {self.parent}, on {topics},", limits)
+        self.remarks += remarks
         if remarks:
             self._jumps = found.jumps[found.kept]
             self._positions, self._quaternions = positions[found.kept], turns[found.kept]
