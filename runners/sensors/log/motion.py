@@ -16,6 +16,7 @@ _NANOSECONDS = 1e9
 _NOISE = np.array([0.02, 0.1])  # m, rad: a pose may be off by this in no time at all
 _STEP = np.array([0.01, 0.05])  # m, rad: shorter ways there and back do not matter
 _BACK = 0.25  # of the way there: a sample is back where it was if it is nearer
+_SLOW = 0.5  # of the way there: the motion before or after an outlier is slower
 _BRISK = 500.0  # steps / s^2: the same again and again at 10 m/s^2 or 50 rad/s^2
 _SUDDEN = 2500.0  # steps / s^2: there and back at 50 m/s^2 or 250 rad/s^2, beyond any arm
 _WINDOW, _OFTEN = 16, 5  # so often there and back in so many samples are two publishers
@@ -117,10 +118,18 @@ def _there_and_back(
     steps = (distances(left[:-1], left[1:]) / _STEP).max(axis=1)
     least = np.minimum(steps[:-1], steps[1:])
     back = (least > 1.0) & _is_back(distances, left[:-2], left[2:], least)
+    # A robot that turns round was fast before and is fast after it, and does not turn at once.
+    beside = np.concatenate([[np.inf], steps, [np.inf]])
+    slow = np.minimum(beside[:-3], beside[3:]) < _SLOW * least
+    turns = np.concatenate([[False], back, [False]])
+    back &= slow | turns[:-2] | turns[2:]
     squared = seconds[:-1] * seconds[1:]
-    often = np.convolve(back & (least > _BRISK * squared), np.ones(_WINDOW))[: len(back)] >= _OFTEN
-    for last in np.flatnonzero(often):
-        disputed[max(last + 2 - _WINDOW, 0) : last + 3] = True
+    brisk = back & (least > _BRISK * squared)
+    often = np.convolve(brisk, np.ones(_WINDOW))[: len(brisk)] >= _OFTEN
+    for last in np.flatnonzero(often).tolist():
+        first = max(last + 1 - _WINDOW, 0)
+        middles = first + np.flatnonzero(brisk[first : last + 1])
+        disputed[middles[0] : middles[-1] + 3] = True
     outliers[1:-1] = back & (least > _SUDDEN * squared)
     return outliers & ~disputed, disputed
 
