@@ -42,20 +42,21 @@ class FreeMap:
         ahead = ((centres[near] - beside[:, :3]) * beside[:, 3:]).sum(axis=1)
         return np.delete(centres, near[ahead < 0.0], axis=0)
 
-    def is_entered(self, origin: FloatArray, ends: FloatArray) -> bool:
-        """Whether more than a thousandth of segments from origin (3,) to ends (N, 3) enter it."""
-        lower, upper = self.workspace.bounds
-        with np.errstate(divide="ignore", invalid="ignore"):
-            first, second = (lower - origin) / (ends - origin), (upper - origin) / (ends - origin)
-        begin = np.fmax(np.fmin(first, second).max(axis=1, initial=0.0), 0.0)
-        end = np.fmin(np.fmax(first, second).min(axis=1, initial=1.0), 1.0)
-        return bool((begin <= end).sum() > _LEAST_ENTERING * len(ends))
-
     def within(self, points: FloatArray) -> BoolArray:
         """Which of points (N, 3) lie in the workspace, or less than a voxel beside it."""
         margin = self.grid.lattice.spacing
         lower, upper = self.workspace.bounds
         return ((points >= lower - margin) & (points <= upper + margin)).all(axis=1)
+
+
+def is_entered(workspace: Workspace, origin: FloatArray, ends: FloatArray) -> bool:
+    """Whether more than a thousandth of segments from origin (3,) to ends (N, 3) enter it."""
+    lower, upper = workspace.bounds
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, second = (lower - origin) / (ends - origin), (upper - origin) / (ends - origin)
+    begin = np.fmax(np.fmin(first, second).max(axis=1, initial=0.0), 0.0)
+    end = np.fmin(np.fmax(first, second).min(axis=1, initial=1.0), 1.0)
+    return bool((begin <= end).sum() > _LEAST_ENTERING * len(ends))
 
 
 @dataclass(frozen=True)

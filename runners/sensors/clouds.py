@@ -10,7 +10,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Lattice
 from chsel.problem.poses import apply
 from chsel.sensing.depth_camera import main_regions, point_regions
-from runners.sensors.cell import RobotCell
+from runners.sensors.cell import RobotCell, is_entered
 from runners.sensors.log.messages import CloudMessage
 from runners.sensors.rig import CloudRig
 from runners.sensors.session_report import Counts
@@ -59,7 +59,7 @@ class Clouds:
             reached = ((points - origin) ** 2).sum(axis=1) <= FARTHEST**2
             ends = origin + self._rig.fraction * (points[reached] - origin)
             counts.free += free.grid.along_rays(origin, ends)
-            self._reaches = self._reaches or free.is_entered(origin, ends)
+            self._reaches = self._reaches or is_entered(free.workspace, origin, ends)
         else:
             reached = free.within(points)
             self._new.append(self._unseen(points[reached], counts))

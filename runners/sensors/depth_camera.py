@@ -18,7 +18,7 @@ from chsel.sensing.depth_camera import (
     valid_pixels,
 )
 from chsel.sensing.free_space import FreeGrid
-from runners.sensors.cell import RobotCell
+from runners.sensors.cell import RobotCell, is_entered
 from runners.sensors.log.messages import ImageMessage
 from runners.sensors.rig import CameraRig, GateRig, ImageRig
 from runners.sensors.session_report import Counts
@@ -166,7 +166,8 @@ class DepthCamera:
         counts.small += small
         counts.used += 1
         if not self._reaches:
-            self._reaches = self._cell.free.is_entered(*some_rays(self._rig, view, usable))
+            rays = some_rays(self._rig, view, usable)
+            self._reaches = is_entered(self._cell.free.workspace, *rays)
         self._last_time, self._last = time, (view, usable)
 
     def remark(self, total: Counts) -> str:

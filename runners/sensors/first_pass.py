@@ -32,7 +32,7 @@ from runners.sensors.session_report import LogWarnings
 Progress = Callable[[int, int], None]
 
 _TRANSFORMS = ("TFMessage", "TransformStamped", "FrameTransform", "FrameTransforms")
-_RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
+RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
 _FIRST = 10  # images of a sensor that are looked at, and make up a missing reference
 _MOST_LOST = 0.1  # of the poses of a sensor: more without a transform are a warning
 _LEAST_WITHIN = 0.01  # of the numbers, or else these are no depths in metres
@@ -188,7 +188,7 @@ class FirstPass:
         height, width = images[0].shape
         rectified = sensor.rectified
         if rectified is None:
-            rectified = _RECTIFIED.search(sensor.depth) is not None
+            rectified = RECTIFIED.search(sensor.depth) is not None
         camera = info.rectified if rectified and info.rectified is not None else info.camera
         if (info.camera.height, info.camera.width) != (height, width):
             raise self._error(

@@ -16,7 +16,7 @@ from chsel.problem.points import KnownPoints, check_points
 from chsel.problem.settings import CheckedSettings, not_negative, positive
 from replay.files import file_digest
 from runners.objects.loader import ObjectModel
-from runners.sensors.cell import FreeMap, RobotCell
+from runners.sensors.cell import FreeMap, RobotCell, is_entered
 from runners.sensors.depth_camera import (
     MISSED,
     View,
@@ -230,7 +230,7 @@ class DepthFrameSession:
                 yield "warning", text
         view = View(frame.depth, found.rays, frame.camera, frame.world_from_camera)
         rays = some_rays(self._rig.cameras[0], view, found.rays)
-        if not FreeMap(self.workspace, self.free_resolution).is_entered(*rays):
+        if found.rays.any() and not is_entered(self.workspace, *rays):
             yield "warning", f"{name}: {MISSED}"
         for sensor, counts in ((name, found.counts), ("label", label)):
             if counts is not None and (left_out := counts.left_out()):
