@@ -17,7 +17,7 @@ from runners.sensors.log.messages import (
     WrenchMessage,
 )
 from runners.sensors.log.raw_log import RawLog
-from runners.simulated_robot.log_writer import image
+from runners.simulated_robot.log_writer import image, transform
 from tests.runners.sensors.foxglove_log import in_foxgloves_messages
 from tests.runners.sensors.small_logs import BEGIN, SECOND, depth, png, ros2_sent, write_ros2, xyz
 
@@ -110,6 +110,16 @@ def test_broken_messages_are_counted_with_their_topic(tmp_path):
     said = " ".join(log.faults)
     assert "'rgb8' is no depth" in said
     assert "a force or torque is not finite" in said
+
+
+def test_of_several_transforms_only_the_broken_one_is_left_out(tmp_path):
+    parts = [transform("base", name, moved(x, 0, 0), 5) for name, x in (("a", np.nan), ("b", 1))]
+    sent = [("/tf", "tf2_msgs/TFMessage", {"transforms": parts}, 9)]
+    write_ros2(tmp_path / "log.mcap", sent)
+    log = RawLog(tmp_path / "log.mcap")
+    (received,) = log.messages(["/tf"])
+    assert_same(received.content, TransformMessage("base", "b", moved(1, 0, 0)))
+    assert list(log.faults.values()) == [1]
 
 
 def test_intrinsics_are_those_of_the_pixels_that_are_sent(tmp_path):

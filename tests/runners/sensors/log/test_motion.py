@@ -1,5 +1,7 @@
 """Motions that no robot makes: outliers, jumps, and publishers that contradict each other."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from runners.sensors.log.messages import Received
 from runners.sensors.log.motion import MotionLimits
 from runners.sensors.log.transforms import JointHistory
 from runners.sensors.rig import BoxRig, HandRig, Rig
-from runners.simulated_robot.log_writer import transform
+from runners.simulated_robot.log_writer import joint_state, transform
 from tests.runners.sensors.small_logs import BEGIN, SECOND, read, write_ros2
 
 RIG = Rig(
@@ -191,6 +193,37 @@ def test_two_nodes_that_send_one_joint_leave_it_unknown():
     joints, told = history(*[0.04, 0.0] * 50)
     assert states(joints) == [None]
     assert joints.first() == {}
+
+
+URDF = """<robot name="g"><link name="palm"/><link name="tip"><collision><geometry>
+<box size="0.02 0.02 0.02"/></geometry></collision></link><joint name="finger" type="prismatic">
+<parent link="palm"/><child link="tip"/><axis xyz="0 1 0"/></joint></robot>"""
+
+
+def test_a_hand_whose_joints_are_unknown_sweeps_nothing(tmp_path):
+    pytest.importorskip("yourdfpy")
+    (tmp_path / "hand.urdf").write_text(URDF)
+    hand = HandRig("tool0", urdf=str(tmp_path / "hand.urdf"), joints="/joint_states")
+    free, told = {}, {}
+    for name, others in (("one", ()), ("two", (0.1,))):
+        sent = []
+        for seconds, place in WAY:
+            time = BEGIN + round(seconds * SECOND)
+            moving = transform("base", "tool0", compose(np.eye(3), place), time)
+            sent.append(("/tf", "tf2_msgs/TFMessage", {"transforms": [moving]}, time))
+            for number, value in enumerate((0.0, *others)):
+                states = joint_state(["wheel", "finger"], [np.nan, value], time + number * 10**7)
+                sent.append(("/joint_states", "sensor_msgs/JointState", states, time))
+        write_ros2(tmp_path / "log.mcap", sent)
+        session, probes, told[name] = read(tmp_path / "log.mcap", replace(RIG, hand=hand))
+        free[name] = np.concatenate([probe.new_points.free for probe in probes])
+    assert len(free["one"]) == 24
+    assert "joints" not in told["one"]
+    assert len(free["two"]) == 0
+    assert "the hand's joints, on /joint_states, alternates between places" in told["two"]
+    counts = session.report.total()["hand"]
+    assert (counts.images, counts.lost, counts.used) == (101, 101, 0)
+    assert "hand: none of its 101 messages was of use: 101 without a pose" in told["two"]
 
 
 def test_a_value_that_is_nan_leaves_the_joint_where_it_was():
