@@ -23,7 +23,7 @@ _WINDOW, _OFTEN = 16, 5  # so often there and back in so many samples are two pu
 _MOST_TRACKS = 8  # that a sample may continue, those of late
 _OUTLIERS = 1 / 3  # of the samples of a motion beside it: fewer are outliers, not a publisher
 _MANY = 0.1  # of all samples: more outliers may be of another publisher
-_SHORT = 0.05  # of the samples of the longest motion: fewer at an end of the log are outliers
+_SHORT, _FEW = 0.05, 3  # of the samples of the longest motion, or so many: fewer are outliers
 
 
 @dataclass(frozen=True)
@@ -178,12 +178,17 @@ def _choose(
     sizes = np.bincount(tracks)
     longest = int(sizes.argmax())
     accepted = tracks == longest
+    short = sizes < max(_FEW, _SHORT * sizes[longest])
+    short[longest] = False
+    outliers[left[short[tracks]]] = True
     for number in np.argsort(-sizes, kind="stable").tolist()[1:]:
+        if short[number]:
+            break
         own, others = np.flatnonzero(tracks == number), np.flatnonzero(accepted)
         within = own[(own > others[0]) & (own < others[-1])]
         among = others[(others > own[0]) & (others < own[-1])]
         if len(within) == 0:
-            leave_out = len(own) < _SHORT * sizes[longest]
+            leave_out = False
         elif len(among) == 0:
             # It left a place, and comes back to it.
             place = int(np.searchsorted(others, own[0]))

@@ -235,3 +235,11 @@ def test_a_value_that_is_nan_leaves_the_joint_where_it_was():
     assert joints.during(0, 2 * SECOND)[-1][1] == {"finger": 0.04, "wrist": 1.0}
     said = "/joints: joint finger is not a finite number; it counts as unmoved"
     assert joints.faults == {said: 1}
+
+
+def test_of_poses_at_random_next_to_nothing_is_swept(tmp_path):
+    random = np.random.default_rng(0)
+    samples = [(0.02 * n, random.uniform([0, -0.5, 0], [1, 0.5, 0.6])) for n in range(60)]
+    free, told = swept(tmp_path, samples)
+    assert len(free) < 40  # of 60 hands of eight voxels
+    assert "samples are left out" in told
