@@ -35,6 +35,7 @@ MALFORMED = (
 )
 """What reading records may raise."""
 
+COMPRESSIONS = ("", "zstd", "lz4")  # of chunks that are read
 ACCEPTED = "accepted: a recording.mcap that this project wrote"
 _FOOTER = struct.Struct("<QQI")  # where summary and its offsets start, checksum
 _MOST_UNPACKED = 2**29  # bytes of a chunk; writers make chunks of megabytes, or of one large image
@@ -73,8 +74,15 @@ def chunk_at(file: IO[bytes], size: int, place: int) -> Chunk:
     return record
 
 
+def unknown_compression(name: str) -> str:
+    """What is wrong with a chunk whose compression is not read."""
+    return f"a chunk is compressed by {one_line(name)!r}; accepted: zstd, lz4, or none"
+
+
 def unpacked(chunk: Chunk) -> list[McapRecord]:
     """The records in a chunk; any of MALFORMED if it is not whole, or larger than is plausible."""
+    if chunk.compression not in COMPRESSIONS:  # the package takes its bytes as they are
+        raise ValueError(unknown_compression(chunk.compression))
     size = chunk.uncompressed_size
     if chunk.compression == "zstd":
         size = max(size, zstandard.frame_content_size(chunk.data))

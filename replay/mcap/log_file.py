@@ -14,15 +14,29 @@ from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import SessionError
 from chsel.numerics.arrays import refuse_special_file
-from replay.mcap.file import MALFORMED, chunk_at, file_records, file_summary, reason_of, unpacked
+from replay.mcap.file import (
+    COMPRESSIONS,
+    MALFORMED,
+    chunk_at,
+    file_records,
+    file_summary,
+    reason_of,
+    unknown_compression,
+    unpacked,
+)
 from replay.mcap.texts import one_line
 
 ACCEPTED = "accepted: an .mcap file, or a rosbag2 folder with MCAP storage"
 ROS1_BAG = b"#ROSBAG "  # as long as MCAP0_MAGIC
 _CONVERT = (
     "convert it with `pip install rosbags`, `rosbags-convert --src LOG.bag --dst LOG "
-    "--dst-storage mcap`, and pass the folder LOG"
+    "--dst-storage mcap --dst-typestore ros2_humble`, and pass the folder LOG"
 )
+OTHER_LOGS = {
+    b"\x28\xb5\x2f\xfd": ("compressed by zstd", "unpack it with `zstd -d FILE`"),
+    b"SQLite f": ("a rosbag2 file in sqlite3", "convert its folder with `ros2 bag convert`"),
+}
+"""What logs of other kinds begin with, what they are, and what to do."""
 _END_OF_TIME = 2**63
 _ROS_TEXTS = ("ros2msg", "ros1msg")
 
@@ -67,6 +81,9 @@ class RawFile:
         try:
             with path.open("rb") as file:
                 start = file.read(len(MCAP0_MAGIC))
+                for begin, (kind, advice) in OTHER_LOGS.items():
+                    if start.startswith(begin):
+                        raise SessionError(f"log {path} is {kind}; {ACCEPTED}: {advice}")
                 if start == ROS1_BAG or (path.suffix == ".bag" and start != MCAP0_MAGIC):
                     raise SessionError(f"log {path} is a ROS 1 bag; {ACCEPTED}: {_CONVERT}")
                 if start != MCAP0_MAGIC:
@@ -158,6 +175,9 @@ class RawFile:
             statistics.message_count and not summary.chunk_indexes
         ):
             return False
+        for chunk in summary.chunk_indexes:
+            if chunk.compression not in COMPRESSIONS:
+                raise SessionError(f"log {self.path}: {unknown_compression(chunk.compression)}")
         for described in (*summary.schemas.values(), *summary.channels.values()):
             self._describe(described)
         self.counts = statistics.channel_message_counts

@@ -27,7 +27,7 @@ from chsel.problem.mesh import mesh_digest
 from replay.console import Console, plain_table, print_error
 from replay.mcap.file import MALFORMED, McapFile, recover_hint
 from replay.mcap.foxglove_messages import TOPIC_SCHEMAS
-from replay.mcap.log_file import ROS1_BAG, Channel, RawFile
+from replay.mcap.log_file import OTHER_LOGS, ROS1_BAG, Channel, RawFile
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.schemas import FORMAT_VERSION, PROFILE
 
@@ -144,13 +144,13 @@ def step_rows(recording: Recording) -> list[dict[str, Any]]:
 
 
 def is_other_programs(path: str | Path) -> bool:
-    """Whether a file is a robot's: a ROS 1 bag, or MCAP, by its header not a recording of ours."""
+    """Whether a file is a robot's: MCAP, by its header not a recording of ours, or of ROS."""
     path = Path(path).expanduser()
     if not path.is_file():  # a FIFO would be waited for
         return False
     try:
         with path.open("rb") as file:
-            if file.read(len(ROS1_BAG)) == ROS1_BAG:
+            if file.read(len(ROS1_BAG)).startswith((ROS1_BAG, *OTHER_LOGS)):
                 return True
             file.seek(0)
             header = next(StreamReader(file, record_size_limit=_LONGEST_HEADER).records, None)

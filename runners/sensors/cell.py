@@ -15,6 +15,8 @@ from runners.sensors.log.transforms import TransformError, TransformTree
 from runners.sensors.rig import GateRig
 from runners.sensors.session_report import LogWarnings
 
+_LEAST_ENTERING = 0.001  # of a sensor's rays: fewer in the workspace are there by chance
+
 
 class FreeMap:
     """The voxels of the workspace that are known to be free."""
@@ -45,6 +47,16 @@ class FreeMap:
         margin = self.grid.lattice.spacing
         lower, upper = self.workspace.bounds
         return ((points >= lower - margin) & (points <= upper + margin)).all(axis=1)
+
+
+def is_entered(workspace: Workspace, origin: FloatArray, ends: FloatArray) -> bool:
+    """Whether more than a thousandth of segments from origin (3,) to ends (N, 3) enter it."""
+    lower, upper = workspace.bounds
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, second = (lower - origin) / (ends - origin), (upper - origin) / (ends - origin)
+    begin = np.fmax(np.fmin(first, second).max(axis=1, initial=0.0), 0.0)
+    end = np.fmin(np.fmax(first, second).min(axis=1, initial=1.0), 1.0)
+    return bool((begin <= end).sum() > _LEAST_ENTERING * len(ends))
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,12 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Lattice
 from chsel.problem.poses import apply
 from chsel.sensing.depth_camera import main_regions, point_regions
-from runners.sensors.cell import RobotCell
+from runners.sensors.cell import RobotCell, is_entered
 from runners.sensors.log.messages import CloudMessage
 from runners.sensors.rig import CloudRig
 from runners.sensors.session_report import Counts
 
+_MOST_OUTSIDE = 0.99  # of its points: more are no object's
 FARTHEST = 100.0  # m: no robot that probes an object measures rays of this length
 
 
@@ -30,6 +31,7 @@ class Clouds:
         self._seen: set[tuple[int, int, int]] = set()
         self._new: list[FloatArray] = []
         self._place: FloatArray | None = None
+        self._reaches = rig.role != "rays"  # whether its rays reach the workspace
 
     @property
     def touches(self) -> bool:
@@ -57,21 +59,32 @@ class Clouds:
             reached = ((points - origin) ** 2).sum(axis=1) <= FARTHEST**2
             ends = origin + self._rig.fraction * (points[reached] - origin)
             counts.free += free.grid.along_rays(origin, ends)
+            self._reaches = self._reaches or is_entered(free.workspace, origin, ends)
         else:
             reached = free.within(points)
             self._new.append(self._unseen(points[reached], counts))
         counts.outside += int((~reached).sum())
 
-    def check(self, total: Counts) -> None:
-        """Warn if no point of a whole log was within reach."""
-        if self._place is not None and total.outside == total.pixels - total.invalid:
-            place = ", ".join(f"{value:.4g}" for value in self._place)
-            rays = self._rig.role == "rays"
-            reach = f"over {FARTHEST:g} m away" if rays else "out of the workspace"
-            self._cell.warnings.warn(
-                f"{self._rig.topic}: all {total.outside} points are {reach}, in the first message "
-                f"around [{place}] m in the world; check its unit and frame, and the workspace"
-            )
+    def remark(self, total: Counts) -> str:
+        """What is suspicious about all that it gave; "" if nothing is."""
+        measured = total.pixels - total.invalid
+        if total.used and not measured:
+            return f"its {total.used} messages have no point that is finite"
+        if self._place is None:
+            return ""
+        place = ", ".join(f"{value:.4g}" for value in self._place)
+        where = f"in the first message around [{place}] m in the world"
+        if total.outside > _MOST_OUTSIDE * measured:
+            reach = "out of the workspace"
+            if self._rig.role == "rays":
+                reach = f"over {FARTHEST:g} m away"
+            share = "all" if total.outside == measured else f"of {measured} points"
+            text = f"{share} {total.outside} points are {reach}, {where}"
+        elif not self._reaches:
+            text = f"its rays miss the workspace, their points are {where}"
+        else:
+            return ""
+        return f"{text}; check its unit and frame, and the workspace"
 
     def surface(self) -> FloatArray:
         """Points (N, 3) on the surface that came since the last call."""

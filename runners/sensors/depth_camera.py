@@ -9,6 +9,7 @@ import numpy as np
 
 from chsel.events import SensorImage
 from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.problem.poses import apply
 from chsel.sensing.depth_camera import (
     PinholeCamera,
     depth_regions,
@@ -17,14 +18,36 @@ from chsel.sensing.depth_camera import (
     valid_pixels,
 )
 from chsel.sensing.free_space import FreeGrid
-from runners.sensors.cell import RobotCell
+from runners.sensors.cell import RobotCell, is_entered
 from runners.sensors.log.messages import ImageMessage
 from runners.sensors.rig import CameraRig, GateRig, ImageRig
 from runners.sensors.session_report import Counts
 
 INTEGER_UNIT = 0.001  # m: of 16-bit depth images, as all the world has it
 FINE, COARSE = 0.0001, 0.001  # m: units of recorded images
+_OFF_CENTRE = 0.08  # of a side of the image, by which principal points are off its middle at most
+_MANY_PIXELS = 50_000  # of an image: more are looked at in part
 _EARLY = 0.95  # of the interval between two images: stamps are not exact
+
+
+def exchanged_centre(camera: PinholeCamera) -> str:
+    """What is suspicious about the principal point of a camera; "" if nothing is."""
+    middle = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
+    size = np.array([camera.width, camera.height])
+    away = (np.abs(np.array([camera.cx, camera.cy]) - middle) / size).max()
+    exchanged = (np.abs(np.array([camera.cy, camera.cx]) - middle) / size).max()
+    if away > _OFF_CENTRE and exchanged < 0.5 * away:
+        return (
+            f"cx {camera.cx:g} and cy {camera.cy:g} look exchanged, as its images have "
+            f"{camera.width} x {camera.height} pixels; check its intrinsics"
+        )
+    return ""
+
+
+MISSED = (
+    "its rays miss the workspace; check its frame, which must be the optical one (x right, z "
+    "forward), its pose, and the workspace"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +124,13 @@ def mark_rays(
     return grid.from_depth(ends, view.camera, pose, usable, fraction=rig.fraction), small
 
 
+def some_rays(rig: CameraRig, view: View, usable: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Origin (3,) and ends (N, 3), world, of the rays of some of the usable pixels (H, W)."""
+    pose, some = view.world_from_camera, slice(None, None, 1 + usable.size // _MANY_PIXELS)
+    ends = rig.fraction * view.camera.back_project(view.metres)[some, some]
+    return pose[:3, 3], apply(pose, ends[usable[some, some]])
+
+
 class DepthCamera:
     """Marks what it sees through (CHSEL, Sec. V-B: rays to 95 % of the depth)."""
 
@@ -111,6 +141,7 @@ class DepthCamera:
         several, workspace = rig.views > 1, cell.free.workspace
         self._own = FreeGrid(workspace, cell.spacing, views=rig.views) if several else None
         self._last_time: int | None = None
+        self._reaches = False  # whether its rays reach the workspace
         self._last: tuple[View, BoolArray] | None = None
 
     def take(self, time: int, message: ImageMessage, counts: Counts, *, within: bool) -> None:
@@ -134,7 +165,16 @@ class DepthCamera:
         counts.free += fresh if self._own is None else grid.at(self._own.new())
         counts.small += small
         counts.used += 1
+        if not self._reaches:
+            rays = some_rays(self._rig, view, usable)
+            self._reaches = is_entered(self._cell.free.workspace, *rays)
         self._last_time, self._last = time, (view, usable)
+
+    def remark(self, total: Counts) -> str:
+        """What is suspicious about all that it gave; "" if nothing is."""
+        if self._reaches or not total.used:
+            return ""
+        return f"{MISSED} (all of {total.used} images)"
 
     def image(self, step: int) -> SensorImage | None:
         """The last image since the last call, with the pixels whose rays are free."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from chsel.errors import SessionError, SettingError
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.sensing.depth_camera import PinholeCamera, valid_pixels
-from runners.sensors.depth_camera import metres
+from runners.sensors.depth_camera import exchanged_centre, metres
 from runners.sensors.log.clocks import Clocks
 from runners.sensors.log.messages import (
     CameraInfoMessage,
@@ -20,6 +21,7 @@ from runners.sensors.log.messages import (
     TransformMessage,
     WrenchMessage,
 )
+from runners.sensors.log.motion import MotionLimits
 from runners.sensors.log.probe_windows import ProbeWindow, marked_windows, timed_windows, whole_log
 from runners.sensors.log.raw_log import RawLog
 from runners.sensors.log.transforms import JointHistory, TransformError, TransformTree
@@ -30,7 +32,9 @@ from runners.sensors.session_report import LogWarnings
 Progress = Callable[[int, int], None]
 
 _TRANSFORMS = ("TFMessage", "TransformStamped", "FrameTransform", "FrameTransforms")
+RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
 _FIRST = 10  # images of a sensor that are looked at, and make up a missing reference
+_MOST_LOST = 0.1  # of the poses of a sensor: more without a transform are a warning
 _LEAST_WITHIN = 0.01  # of the numbers, or else these are no depths in metres
 
 
@@ -61,14 +65,18 @@ class FirstPass:
         joint_names: Sequence[str],
         warnings: LogWarnings,
         progress: Progress,
+        *,
+        sliding: Collection[str] = (),
     ) -> None:
         """Look through a log. joint_names: of the joints that move the hand.
+
+        sliding: those of them that are prismatic.
 
         Raises SessionError if topics, camera infos or transforms are missing, or depths are no
         depths.
         """
         self._log, self._rig, self._warnings = log, rig, warnings
-        self.tree, self.joints = TransformTree(), JointHistory(joint_names)
+        self.tree, self.joints = TransformTree(), JointHistory(joint_names, sliding)
         self._sensed = {
             sensor.depth: _Sensed(ImageMessage, "depth images") for sensor in rig.sensors
         }
@@ -83,14 +91,15 @@ class FirstPass:
         self.bulky = tuple(self._sensed)
         self.clocks = clocks.correction()
         self.tree.settle(self.clocks)
-        self.joints.settle(self.clocks)
-        for text in (*log.warnings, *self.clocks.warnings):
+        limits = MotionLimits(rig.max_speed, rig.max_turn)
+        implausible = self.joints.settle(self.clocks, limits)
+        for text in (*log.warnings, *self.clocks.warnings, *implausible):
             warnings.warn(text)
-        for text, count in self.tree.faults.items():
+        for text, count in (self.tree.faults + self.joints.faults).items():
             warnings.warn(text, count)
         for topic, sensed in self._sensed.items():
             sensed.times = np.sort(self.clocks.times(topic, *clocks.of(topic)))
-        self._check_poses()
+        self._check_poses(limits)
         self.windows = self._windows()
         self.cameras = {sensor.name: self._camera(sensor) for sensor in rig.sensors}
         self.references = {pad.name: self._reference(pad) for pad in rig.bubbles}
@@ -114,9 +123,12 @@ class FirstPass:
             if isinstance(content, ImageMessage) and len(sensed.images) < _FIRST:
                 sensed.images.append((received, content.values))
 
-    def _check_poses(self) -> None:
-        """All sensors have messages, and their poses are known at one of their times at least."""
-        rig = self._rig
+    def _check_poses(self, limits: MotionLimits) -> None:
+        """All sensors have messages, and their poses are known at one of their times at least.
+
+        Leaves out samples of their motions that are not plausible.
+        """
+        rig, frames = self._rig, list[tuple[str, str, IntArray]]()
         sensors = [(sensor.name, sensor.depth, sensor.frame) for sensor in rig.sensors]
         sensors += [(cloud.topic, cloud.topic, None) for cloud in rig.clouds]
         sensors += [(force.topic, force.topic, force.frame) for force in rig.forces]
@@ -130,19 +142,42 @@ class FirstPass:
                     f"messages on {topic} of {name} name no frame; accepted: the frame of a "
                     "transform, in the messages or as frame in the rig"
                 )
-            self._require_known(name, frame, sensed.times)
+            frames.append((name, frame, sensed.times))
         if rig.hand is not None and len(self.tree.times):
-            self._require_known("hand", rig.hand.frame, self.tree.times)
+            frames.append(("hand", rig.hand.frame, self.tree.times))
         elif rig.hand is not None:
             self._warnings.warn("no transform of the log ever changes: the hand has no path")
+        for name, frame, _ in frames:
+            try:
+                remarks = self.tree.check_motions(rig.world, [frame], limits)
+            except TransformError as error:
+                raise self._error(f"{name}: {error}") from None
+            for remark in remarks:
+                self._warnings.warn(remark)
+        for name, frame, times in frames:
+            self._require_known(name, frame, times)
 
     def _require_known(self, name: str, frame: str, times: IntArray) -> None:
         world, gap = self._rig.world, self._rig.clock.gap
         try:
-            if not self.tree.lookups(world, frame, times, gap_s=gap)[1].any():
+            known = self.tree.lookups(world, frame, times, gap_s=gap)[1]
+            if not known.any():
                 self.tree.lookup(world, frame, int(times[len(times) // 2]), gap_s=gap)
         except TransformError as error:
             raise self._error(f"{name}: {error}") from None
+        lost = int((~known).sum())
+        if lost <= _MOST_LOST * len(times):
+            return
+        once = " and ".join(self.tree.sent_once(world, frame))
+        reason = f"{once} was sent once, which counts for {gap:g} s; accepted: on tf_static"
+        if not once:
+            try:
+                self.tree.lookup(world, frame, int(times[~known][0]), gap_s=gap)
+            except TransformError as error:
+                reason = str(error)
+        self._warnings.warn(
+            f"{name}: {lost} of {len(times)} poses of {frame} are not known, and left out: {reason}"
+        )
 
     def _camera(self, sensor: ImageRig) -> PinholeCamera:
         """The intrinsics of a sensor, which fit its images."""
@@ -151,18 +186,30 @@ class FirstPass:
             raise self._error(f"no camera info of {sensor.name} on {sensor.info}", sensor.info)
         images = [values for _, values in self._sensed[sensor.depth].images]
         height, width = images[0].shape
+        rectified = sensor.rectified
+        if rectified is None:
+            rectified = RECTIFIED.search(sensor.depth) is not None
+        camera = info.rectified if rectified and info.rectified is not None else info.camera
         if (info.camera.height, info.camera.width) != (height, width):
             raise self._error(
                 f"images of {sensor.name} have {width} x {height} pixels, and its camera info says "
                 f"{info.camera.width} x {info.camera.height}; accepted: the same"
             )
-        if info.distorted:
+        if info.distorted and not rectified:
             self._warnings.warn(
                 f"{sensor.name}: its camera info names a distortion, which is not undone"
             )
+        if sensor.rectified is None and not rectified and _differ(info):
+            self._warnings.warn(
+                f"{sensor.name}: K and P of its camera info differ, and topic {sensor.depth} does "
+                "not say that its images are rectified: K is used; with rectified: true in the "
+                "rig, P is"
+            )
+        if exchanged := exchanged_centre(camera):
+            self._warnings.warn(f"{sensor.name}: {exchanged}")
         if not (isinstance(sensor, BubbleRig) and sensor.kind == "deformation"):
             _check_unit(sensor, images)
-        return info.camera
+        return camera
 
     def _windows(self) -> list[ProbeWindow]:
         """The probes of the log; all of it is one without markers."""
@@ -228,6 +275,15 @@ def _topics(log: RawLog, rig: Rig) -> set[str]:
         )
     kinds = {name: schema.replace(".", "/") for name, schema in log.topics.items()}
     return {*topics, *(name for name, kind in kinds.items() if kind.split("/")[-1] in _TRANSFORMS)}
+
+
+def _differ(info: CameraInfoMessage) -> bool:
+    """Whether rectified images have other intrinsics, by more than half a pixel."""
+    one, other = info.camera, info.rectified
+    if other is None:
+        return False
+    numbers = ("fx", "fy", "cx", "cy")
+    return any(abs(getattr(one, name) - getattr(other, name)) > 0.5 for name in numbers)
 
 
 def _check_unit(rig: ImageRig, images: list[np.ndarray]) -> None:

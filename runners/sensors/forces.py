@@ -58,6 +58,7 @@ class Forces:
         self._idle: deque[tuple[int, FloatArray]] = deque(maxlen=_MOST_TARED)
         self._tare: FloatArray | None = None
         self._within = self._has_torque = self._in_contact = False
+        self._largest = 0.0  # newtons
         self._row: list[_Sample] = []  # not yet long enough for a contact
         self._felt: list[_Sample] = []
 
@@ -74,6 +75,7 @@ class Forces:
             counts.used += 1
             beyond = numbers - self._tare
             newtons = float(np.sqrt((beyond[:3] ** 2).sum()))
+            self._largest = max(self._largest, newtons)
             self._look(_Sample(newtons, time, message.frame, tuple(beyond.tolist())), counts)
             return
         self._end_row(counts)
@@ -85,6 +87,20 @@ class Forces:
                 f"{self._rig.tare:g} s are its tare"
             )
             self._set_tare(time)
+
+    def remark(self, total: Counts) -> str:
+        """What is suspicious about all that it gave; "" if nothing is."""
+        if not total.used or total.contacts:
+            return ""
+        if total.outside:
+            return (
+                f"none of {total.outside} lines of force meets the hand in the workspace; check "
+                "frame, acts, torque, and the solids of the hand"
+            )
+        return (
+            f"no contact in {total.used} messages: their largest force is {self._largest:.3g} N, "
+            f"the threshold {self._rig.threshold:g} N for {self._rig.samples} in a row"
+        )
 
     def contacts(self, counts: Counts) -> FloatArray:
         """The contacts (C, 6) since the last call, the strongest first: points and normals."""
@@ -134,7 +150,14 @@ class Forces:
         if world_from_sensor is None or world_from_hand is None:
             counts.lost += 1
             return None
-        solids = self._model.solids(self._joints.during(sample.time, sample.time + 1)[0][1])
+        joints = self._joints.during(sample.time, sample.time + 1)[0][1]
+        if joints is None:
+            self._cell.warnings.warn(
+                f"{self._rig.topic}: left out, as the hand's joints are not known"
+            )
+            counts.lost += 1
+            return None
+        solids = self._model.solids(joints)
         assert solids is not None  # a rig with forces has some
         corners = np.asarray(solids.triangles, dtype=np.float64).reshape(-1, 3)
         sensor_from_hand = inverse(world_from_sensor) @ world_from_hand

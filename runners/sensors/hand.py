@@ -33,12 +33,14 @@ _MOVING = ("revolute", "continuous", "prismatic")
 class HandModel:
     """The solids of a hand, read once, placed as often as joints move.
 
-    joint_names: joints whose values move any of them. warnings: what a user should know of how
-    they were read. Raises SettingError for a URDF that cannot be used.
+    joint_names: joints whose values move any of them. sliding: those of them that are prismatic.
+    warnings: what a user should know of how they were read. Raises SettingError for a URDF that
+    cannot be used.
     """
 
     def __init__(self, rig: HandRig) -> None:
         self.joint_names: tuple[str, ...] = ()
+        self.sliding: frozenset[str] = frozenset()
         self.warnings: list[str] = []
         self._boxes = [box_mesh(box) for box in rig.boxes]
         self._links: list[tuple[str, trimesh.Trimesh]] = []  # nodes of the scene, with their solids
@@ -82,6 +84,8 @@ class HandModel:
         joints = [j for j in robot.robot.joints if j.parent in below and j.type in _MOVING]
         drivers = (joint.mimic.joint if joint.mimic else joint.name for joint in joints)
         self.joint_names = tuple(dict.fromkeys(drivers))
+        kinds = {joint.name: joint.type for joint in robot.robot.joints}
+        self.sliding = frozenset(n for n in self.joint_names if kinds[n] == "prismatic")
         for node in scene.graph.nodes_geometry:
             if node in below:
                 link = scene.graph.transforms.parents[node]
@@ -180,6 +184,7 @@ class HandPath:
         """times (T,): of all transforms, nanoseconds, ascending."""
         self._frame, self._model, self._joints, self._times = rig.frame, model, joints, times
         self._cell = cell
+        self._reaches = False  # whether its solids reach the workspace
         self._filled: dict[bytes, FloatArray] = {}  # points in each part, by its vertices
 
     def follow(self, window: ProbeWindow, counts: Counts) -> FloatArray:
@@ -188,22 +193,43 @@ class HandPath:
         states = self._joints.during(window.opens, window.closes)
         ends = [time for time, _ in states[1:]] + [window.closes]
         for (begin, joints), end in zip(states, ends, strict=True):
+            if joints is None:
+                unknown = int(np.diff(np.searchsorted(self._times, (begin, end)))[0])
+                counts.images += unknown
+                counts.lost += unknown
+                continue
             interior = self._interior(joints)
             reach = float(np.sqrt((interior**2).sum(axis=1).max(initial=0.0)))
             for poses in self._runs(begin, end, counts):
                 # No interior point moves by more than half a voxel from one pose to the next.
                 dense = poses_between(poses, step=0.5 * self._cell.spacing, radius=reach)
                 if len(interior):
+                    self._reaches = self._reaches or self._is_near(dense[:, :3, 3], reach)
                     counts.free += self._cell.free.grid.at(interior, poses=dense)
                 shown.append(dense)
         path = np.concatenate(shown)
         count = min(len(path), MOST_POSES)
         return path[np.linspace(0, len(path) - 1, count).astype(int)]
 
+    def remark(self, total: Counts) -> str:
+        """What is suspicious about all that it gave; "" if nothing is."""
+        if self._reaches or not total.used or self._model.solids() is None:
+            return ""
+        return (
+            f"none of its {total.used} poses brings it into the workspace; check its frame, the "
+            "unit of its poses, and the workspace"
+        )
+
+    def _is_near(self, places: FloatArray, reach: float) -> bool:
+        """Whether any of places (P, 3) is less than `reach` metres beside the workspace."""
+        lower, upper = self._cell.free.workspace.bounds
+        return bool(((places > lower - reach) & (places < upper + reach)).all(axis=1).any())
+
     def _runs(self, begin: int, end: int, counts: Counts) -> Iterator[FloatArray]:
         """Poses (P, 4, 4) from a time to before another, cut where they are not known for long."""
         times = self._times[slice(*np.searchsorted(self._times, (begin, end)))]
         cell = self._cell
+        jumps = cell.tree.jumps(cell.world, self._frame) if len(times) else times
         for start in range(0, len(times), _BATCH):
             # One pose of the batch before, so that nothing is missing between them.
             stamps = times[max(start - 1, 0) : start + _BATCH]
@@ -211,7 +237,9 @@ class HandPath:
             counts.images += len(stamps)
             counts.used += int(known.sum())
             counts.lost += int(len(stamps) - known.sum())
-            cuts = np.flatnonzero(np.diff(stamps[known]) > cell.gap * 1e9) + 1
+            jumped = np.searchsorted(jumps, stamps[known], side="right")
+            unknown = (np.diff(stamps[known]) > cell.gap * 1e9) | (np.diff(jumped) > 0)
+            cuts = np.flatnonzero(unknown) + 1
             yield from (run for run in np.split(poses[known], cuts) if len(run))
 
     def _interior(self, joints: dict[str, float]) -> FloatArray:

@@ -126,6 +126,16 @@ class Pad:
         counts.used += within or moved
         counts.spared += not (within or moved)
 
+    def remark(self, total: Counts) -> str:
+        """What is suspicious about all that it gave; "" if nothing is."""
+        if not total.used or total.free or total.contacts:
+            return ""
+        return (
+            f"its {total.used} images give no contact and no free voxel; check its frame, which "
+            "must be the optical one (x right, z forward), its pose, range and reference, and the "
+            "workspace"
+        )
+
     def strongest(self, counts: Counts) -> Imprint | None:
         """The image of the contact since the last call."""
         best, self._best = self._best, None

@@ -51,6 +51,9 @@ class ImageRig(CheckedSettings):
     """Metres a unit of the image; null: 0.001 for integers, else 1."""
 
     range: Depths = (0.2, 5.0)  # metres, depths beyond are invalid
+    rectified: bool | None = None
+    """Whether P of its intrinsics counts in place of K; null: by the topic of its images, which is
+    image_rect or the like by the convention of ROS."""
 
 
 @dataclass(frozen=True)
@@ -249,6 +252,10 @@ class Rig(CheckedSettings):
     """Metres; one surface point a voxel of this side is kept of clouds and masks."""
 
     gate: GateRig = field(default_factory=GateRig)
+    max_speed: Annotated[float, positive] = 3.0
+    """m/s; a frame or a joint that moves faster has jumped: nothing is swept across."""
+
+    max_turn: Annotated[float, positive] = 10.0  # rad/s, the same
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -38,6 +38,9 @@ class Sensor(Protocol):
     def take(self, time: int, message: Any, counts: Counts, *, within: bool) -> None:
         """A message of the current probe, at nanoseconds; whether within its begin and end."""
 
+    def remark(self, total: Counts) -> str:
+        """What is suspicious about all that it gave in a log; "" if nothing is."""
+
 
 class SecondPass:
     """All that a rig senses, probe by probe."""
@@ -99,10 +102,18 @@ class SecondPass:
             yield from self._finish(window)
 
     def check(self) -> None:
-        """Remark on topics whose points were all out of reach, once the log is read."""
+        """Warn of sensors that gave next to nothing, once the log is read."""
         total = self._report.total()
-        for topic, cloud in self._clouds.items():
-            cloud.check(total[topic])
+        sensors: dict[str, Sensor | HandPath] = {**self._sensors}
+        if self._hand is not None:
+            sensors[HAND] = self._hand
+        for name, sensor in sensors.items():
+            counts = total[name]
+            text = sensor.remark(counts)
+            if counts.images and not counts.used:
+                text = f"none of its {counts.images} messages was of use: {counts.unused()}"
+            if text:
+                self._cell.warnings.warn(f"{name}: {text}")
 
     def _take(self, window: ProbeWindow, time: int, message: Received) -> None:
         """Hand a message to whoever reads its topic."""

@@ -27,6 +27,15 @@ class Counts:
     contacts: int = 0  # points
     free: int = 0  # voxels that it was the first to mark as free
 
+    def unused(self) -> str:
+        """How many messages were not used, by reason."""
+        reasons = {
+            "outside of probes, or too soon after others": self.spared,
+            "without a pose": self.lost,
+            "unusable": self.unusable,
+        }
+        return ", ".join(f"{count} {reason}" for reason, count in reasons.items() if count)
+
     def left_out(self) -> str:
         """How many pixels, points or forces were left out, by reason; "" if none were."""
         reasons = {

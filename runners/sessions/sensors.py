@@ -16,8 +16,14 @@ from chsel.problem.points import KnownPoints, check_points
 from chsel.problem.settings import CheckedSettings, not_negative, positive
 from replay.files import file_digest
 from runners.objects.loader import ObjectModel
-from runners.sensors.cell import FreeMap, RobotCell
-from runners.sensors.depth_camera import View, recorded_image
+from runners.sensors.cell import FreeMap, RobotCell, is_entered
+from runners.sensors.depth_camera import (
+    MISSED,
+    View,
+    exchanged_centre,
+    recorded_image,
+    some_rays,
+)
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
 from runners.sensors.depth_frame import depth_frame_points, read_depth_frame
 from runners.sensors.first_pass import FirstPass
@@ -33,6 +39,7 @@ from runners.sessions.probing import box_shell
 from runners.sessions.source import ProbeEvent, ProbeSource
 
 NO_POSE = "none"
+_FAR = 10.0  # m: from the world's origin, of no camera or object on or beside a table
 _MANY_EDGES = 0.4  # of a camera's pixels: rather a slanted surface, seen in few pixels
 _MANY_OF_LABEL = 0.2  # of its pixels left out: rather a wrong label
 
@@ -96,7 +103,10 @@ class SensorsSession:
         self._log = RawLog(path)
         self._find_pose(path, settings.pose)
         joints = self._hand.joint_names if self._hand else ()
-        self._first_pass = FirstPass(self._log, rig, joints, self._opening, lambda *_: None)
+        sliding = self._hand.sliding if self._hand else ()
+        self._first_pass = FirstPass(
+            self._log, rig, joints, self._opening, lambda *_: None, sliding=sliding
+        )
         missing = [name for name in joints if name not in self._first_pass.joints.first()]
         if missing:
             self._opening.warn(f"joints without a value are at 0: {', '.join(missing)}")
@@ -150,6 +160,14 @@ class SensorsSession:
         file = Path(chosen).expanduser() if chosen else beside(path)
         if chosen or file.is_file():
             self.world_from_object = read_pose(file)
+            place, (lower, upper) = self.world_from_object[:3, 3], self.workspace.bounds
+            beyond = np.maximum(np.maximum(lower - place, place - upper), 0.0)
+            away = float(np.sqrt((beyond**2).sum()))
+            if away > (self._diameter or _FAR):
+                self._opening.warn(
+                    f"the true pose of {file.name} is {away:.3g} m outside of the workspace; check "
+                    f"its unit, which is metres, and its frame, which is {self._rig.world}"
+                )
             self._opening.note(f"the true pose is that of {file.name}")
 
 
@@ -199,6 +217,21 @@ class DepthFrameSession:
     def _remarks(self, name: str) -> Iterator[tuple[str, str]]:
         """Levels and texts on what was left out, and on what is suspicious."""
         found, label = self._points, self._points.labelled
+        if exchanged := exchanged_centre(self._frame.camera):
+            yield "warning", f"{name}: {exchanged}"
+        frame = self._frame
+        poses = {"world_from_camera": frame.world_from_camera}
+        if self.world_from_object is not None:
+            poses["world_from_object"] = self.world_from_object
+        for key, pose in poses.items():
+            away = float(np.sqrt((pose[:3, 3] ** 2).sum()))
+            if away > _FAR:
+                text = f"{key} is {away:.4g} m from the origin; check its unit, which is metres"
+                yield "warning", text
+        view = View(frame.depth, found.rays, frame.camera, frame.world_from_camera)
+        rays = some_rays(self._rig.cameras[0], view, found.rays)
+        if found.rays.any() and not is_entered(self.workspace, *rays):
+            yield "warning", f"{name}: {MISSED}"
         for sensor, counts in ((name, found.counts), ("label", label)):
             if counts is not None and (left_out := counts.left_out()):
                 yield "info", f"{sensor}: {left_out}"

@@ -44,18 +44,23 @@ class Clocks:
 
     def correction(self) -> ClockCorrection:
         """What must be added to the times of each topic, by all messages so far."""
-        medians = {}
+        medians: dict[str, int] = {}
+        several: dict[str, list[int]] = {}
+        limit = round(self._rig.offset * _NANOSECONDS)
         for topic in self._times:
-            log_times, stamps = self.of(topic)
-            offsets = np.sort((stamps - log_times)[stamps != 0])
-            if len(offsets):
-                medians[topic] = int(offsets[(len(offsets) - 1) // 2])
+            log_times, stamps = (times[self.of(topic)[1] != 0] for times in self.of(topic))
+            if len(stamps):
+                offsets = clock_offsets(log_times, stamps, limit)
+                medians[topic] = offsets[0]
+                if len(offsets) > 1:
+                    several[topic] = offsets
         if self._rig.stamp == "log" or not medians:
             return ClockCorrection(by_log=True)
         ordered = sorted(medians.values())
         middle = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
         typical = min(middle, key=abs)  # the median; of two, the one nearer to the log's clock
-        limit = self._rig.offset * _NANOSECONDS
+        for topic, offsets in several.items():
+            medians[topic] = min(offsets, key=lambda offset: abs(offset - typical))
         shifts = {
             topic: typical - median
             for topic, median in medians.items()
@@ -65,10 +70,20 @@ class Clocks:
             f"the clock of {topic} is {_seconds(-shift)} other topics': its stamps are shifted"
             for topic, shift in sorted(shifts.items())
         ]
+        steps = {}
+        for topic, offsets in sorted(several.items()):
+            known = np.array(offsets, dtype=np.int64)
+            steps[topic] = known, medians[topic] + shifts.get(topic, 0) - known
+            apart = ", ".join(f"{(one - offsets[0]) / _NANOSECONDS:+.4g} s" for one in offsets[1:])
+            warnings.append(
+                f"stamps on {topic} start again or jump against the log's clock, by {apart}: "
+                "each part is shifted to when the log received it"
+            )
         if abs(typical) <= limit:
-            return ClockCorrection(shifts, warnings=tuple(warnings))
-        warnings.append(f"stamps are {_seconds(typical)} the log's clock, all alike")
-        return ClockCorrection(shifts, typical, warnings=tuple(warnings))
+            return ClockCorrection(shifts, steps=steps, warnings=tuple(warnings))
+        alike = "" if steps else ", all alike"
+        warnings.append(f"stamps are {_seconds(typical)} the log's clock{alike}")
+        return ClockCorrection(shifts, typical, steps=steps, warnings=tuple(warnings))
 
 
 @dataclass(frozen=True)
@@ -80,6 +95,10 @@ class ClockCorrection:
 
     typical: int = 0  # ns to add to the log's times of messages without a stamp
     by_log: bool = False  # whether the log's times count for all
+    steps: dict[str, tuple[IntArray, IntArray]] = field(default_factory=dict)
+    """Of topics whose clock was set: offsets (K,) of stamps against the log's times, and what to
+    add (K,) to stamps near each of them, nanoseconds."""
+
     warnings: tuple[str, ...] = ()  # what a user should know of the clocks
 
     def times(self, topic: str, log_times: Any, stamps: Any) -> IntArray:
@@ -87,12 +106,51 @@ class ClockCorrection:
         logged, sent = np.asarray(log_times, np.int64), np.asarray(stamps, np.int64)
         if self.by_log:
             return logged
-        times = np.where(sent == 0, logged + self.typical, sent + self.shifts.get(topic, 0))
+        shift: Any = self.shifts.get(topic, 0)
+        if topic in self.steps:
+            offsets, shifts = self.steps[topic]
+            shift = shifts[np.abs((sent - logged)[..., None] - offsets).argmin(axis=-1)]
+        times = np.where(sent == 0, logged + self.typical, sent + shift)
         return np.clip(times, 0, _END_OF_TIME)
 
     def time(self, received: Received) -> int:
         """When one message was true, nanoseconds."""
         return int(self.times(received.topic, received.log_time, received.stamp or 0))
+
+
+def clock_offsets(log_times: IntArray, stamps: IntArray, limit: int) -> list[int]:
+    """Return the offsets of stamps (N,) against the log's times (N,), nanoseconds, N > 0.
+
+    Several if the sender's clock was set or started again, or senders have several, by more than
+    `limit`: the stamps go back, or advance by more than the log does. Where they advance by less,
+    messages came late, and their stamps are right.
+    """
+    offsets = stamps - log_times
+    starts = [0, *(np.flatnonzero(np.abs(np.diff(offsets)) > limit) + 1).tolist()]
+    clocks = np.zeros(len(offsets), dtype=np.int64)  # number of the clock of each message
+    met: list[tuple[int, int]] = []  # typical offsets of runs of messages, and their clocks
+    clock, count, alone = 0, 1, True
+    for start, end in zip(starts, [*starts[1:], len(offsets)], strict=True):
+        typical = _lower_median(offsets[start:end])
+        known = next((number for offset, number in met if abs(offset - typical) <= limit), None)
+        if known is None and start > 0:
+            sent = stamps[start] - stamps[start - 1]
+            late = 0 <= sent <= log_times[start] - log_times[start - 1]
+            # A single message from before may be one that was kept for whoever comes later.
+            kept = alone and sent > 0
+            if not late and not kept:
+                clock, count = count, count + 1
+        elif known is not None:
+            clock = known
+        if known is None:
+            met.append((typical, clock))
+        clocks[start:end] = clock
+        alone = end - start == 1
+    return [_lower_median(offsets[clocks == clock]) for clock in range(clocks.max() + 1)]
+
+
+def _lower_median(values: IntArray) -> int:
+    return int(np.sort(values)[(len(values) - 1) // 2])
 
 
 def _seconds(nanoseconds: float) -> str:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.records import Schema
@@ -33,7 +34,14 @@ _NANOSECONDS = 10**9
 _END_OF_TIME = 2**63
 _FURTHEST = 1e9  # metres: no robot works further from the origin of its frame
 _FLOATS = {7: "f4", 8: "f8"}  # in sensor_msgs/PointField and foxglove.PackedElementField alike
+_LEAST_SKEW = 0.001  # of a focal length: less is no matter
 _AXES = ("x", "y", "z")
+_ZSTD = b"\x28\xb5\x2f\xfd"  # begin of a frame of zstd; messages of CDR begin with 0
+_COMPRESSED = UnusableMessage(
+    "its messages are compressed one by one by rosbag2 (compression mode message); accepted: what "
+    "`ros2 bag convert` writes without that, or compressed chunks (`ros2 bag record "
+    "--storage-preset-profile zstd_fast`)"
+)
 
 Read = Callable[[Any, str], Content]
 """From a parsed message and its frame to its content."""
@@ -55,6 +63,9 @@ def decoder(name: str, encoding: str, definition: str | None = None) -> Decode:
         return stamp, read(message, frame)
 
     def decode(data: bytes) -> Iterator[Decoded]:
+        if encoding == "cdr" and data.startswith(_ZSTD):
+            yield None, _COMPRESSED
+            return
         message = _checked(name, parse, data)
         if isinstance(message, UnusableMessage):
             yield None, message
@@ -103,7 +114,8 @@ def _ros2_parser(name: str, definition: str | None) -> Callable[[bytes], Any]:
     try:
         parse = DecoderFactory().decoder_for("cdr", schema)
     except Exception as error:  # the parser raises whatever it stumbles over
-        raise UnusableMessage(f"the definition of {name} is not read: {error}") from None
+        advice = "; a ROS 1 bag is converted with --dst-typestore ros2_humble"
+        raise UnusableMessage(f"the definition of {name} is not read: {error}{advice}") from None
     assert parse is not None
     return parse
 
@@ -145,22 +157,55 @@ def _compressed_image(message: Any, frame: str) -> ImageMessage:
 def _ros2_camera(message: Any, _: str) -> CameraInfoMessage:
     """Of the pixels that are sent: a region of the sensor, and several of its pixels as one."""
     region, across, down = message.roi, max(message.binning_x, 1), max(message.binning_y, 1)
-    fx, _, cx, _, fy, cy, *_ = message.k
-    camera = PinholeCamera(
-        (region.width or message.width) // across,
-        (region.height or message.height) // down,
-        fx / across,
-        fy / down,
-        (cx - region.x_offset) / across,
-        (cy - region.y_offset) / down,
-    )
-    return CameraInfoMessage(camera, distorted=any(message.d))
+
+    def camera(numbers: Numbers) -> PinholeCamera:
+        return PinholeCamera(
+            (region.width or message.width) // across,
+            (region.height or message.height) // down,
+            numbers.fx / across,
+            numbers.fy / down,
+            (numbers.cx - region.x_offset) / across,
+            (numbers.cy - region.y_offset) / down,
+        )
+
+    return _camera(camera, message.k, message.p, message.d)
+
+
+def _camera(
+    camera: Callable[[Numbers], PinholeCamera], k: Any, p: Any, d: Any
+) -> CameraInfoMessage:
+    """k, p, d: matrices of the camera as it is (9) and rectified (12, or none), distortion."""
+    rectified = None
+    if len(p) == 12 and p[0] != 0.0:
+        with suppress(UnusableMessage):  # who rectifies no images may leave anything there
+            rectified = camera(_intrinsics("P", [*p[:3], *p[4:7], *p[8:11]]))
+    return CameraInfoMessage(camera(_intrinsics("K", k)), any(d), rectified)
+
+
+class Numbers(NamedTuple):
+    """Focal lengths and principal point of a whole sensor, pixels."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+def _intrinsics(name: str, matrix: Any) -> Numbers:
+    """The numbers in a matrix of a camera (9), row by row."""
+    fx, skew, cx, zero, fy, cy, *last = (float(value) for value in matrix)
+    straight = abs(skew) <= _LEAST_SKEW * abs(fx) and zero == 0.0 and last == [0.0, 0.0, 1.0]
+    if not (straight and np.isfinite([fx, fy, cx, cy]).all()):
+        listed = ", ".join(f"{value:g}" for value in matrix)
+        raise UnusableMessage(f"{name} is [{listed}]; accepted: fx, 0, cx, 0, fy, cy, 0, 0, 1")
+    return Numbers(fx, fy, cx, cy)
 
 
 def _foxglove_camera(message: Any, _: str) -> CameraInfoMessage:
-    fx, _, cx, _, fy, cy, *_ = message.K
-    camera = PinholeCamera(message.width, message.height, fx, fy, cx, cy)
-    return CameraInfoMessage(camera, distorted=any(message.D))
+    size = message.width, message.height
+    return _camera(
+        lambda numbers: PinholeCamera(*size, **numbers._asdict()), message.K, message.P, message.D
+    )
 
 
 def _ros2_cloud(message: Any, frame: str) -> CloudMessage:
@@ -219,11 +264,7 @@ def _joints(message: Any, _: str) -> Joints:
         positions = [(joint.name, joint.position) for joint in known]
     else:
         positions = list(zip(message.name, message.position, strict=True))
-    found = {one_line(name): float(position) for name, position in positions}
-    for name, position in found.items():
-        if not math.isfinite(position):
-            raise UnusableMessage(f"joint {name} is at {position}")
-    return found
+    return {one_line(name): float(position) for name, position in positions}
 
 
 def _ros2_marker(message: Any, _: str) -> str:
@@ -282,6 +323,8 @@ def packed_points(
     for axis in _AXES:
         if axis not in fields or fields[axis][1] not in _FLOATS:
             raise UnusableMessage(f"a point cloud has no field {axis} of float32 or float64")
+    if width * stride * rows == len(data):
+        row = width * stride  # drivers leave it at 0, or at that of an unfiltered cloud
     if row * rows != len(data) or width * stride > row:
         raise UnusableMessage(
             f"a point cloud of {width} x {rows} points of {stride} bytes in rows of {row} bytes "

@@ -7,7 +7,8 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
+from PIL.TiffImagePlugin import BITSPERSAMPLE, SAMPLEFORMAT, TiffImageFile
 
 from chsel.errors import SessionError
 from chsel.numerics.arrays import refuse_special_file
@@ -28,6 +29,8 @@ def pixel_rows(
         raise UnusableMessage(f"encoding {encoding!r} is no depth; accepted: {kinds}")
     kind = np.dtype(_KINDS[encoding]).newbyteorder(">" if big_endian else "<")
     row = width * kind.itemsize
+    if row * height == len(data):
+        step = row  # drivers leave it at 0
     if not 0 < row <= step or height < 1 or step * height != len(data):
         raise UnusableMessage(
             f"an image of {width} x {height} in rows of {step} bytes cannot have {len(data)} bytes"
@@ -71,6 +74,14 @@ def _png_pixels(data: bytes) -> np.ndarray:
     return values.astype(np.uint16, copy=False)
 
 
+def _is_unsigned(image: Image.Image) -> bool:
+    """Whether Pillow reads numbers of 32 bits as signed ones that are not."""
+    if not isinstance(image, TiffImageFile) or image.mode != "I":
+        return False
+    tags = image.tag_v2
+    return tags.get(BITSPERSAMPLE) == (32,) and tags.get(SAMPLEFORMAT, (1,)) == (1,)
+
+
 def read_image(path: Path, where: str) -> np.ndarray:
     """The values (H, W) of a .png, .tiff or .npy as they stand there: integers or floating point.
 
@@ -85,8 +96,15 @@ def read_image(path: Path, where: str) -> np.ndarray:
         elif kind in _FORMATS:
             with Image.open(path, formats=(_FORMATS[kind],)) as image:
                 values = np.asarray(image)
+                if _is_unsigned(image):
+                    values = values.view(np.uint32)
         else:
             raise SessionError("of no known kind")
+    except UnidentifiedImageError:
+        raise SessionError(
+            f"{where} {path}: not a {_FORMATS[kind]} that is read; accepted: integers of 8, 16 or "
+            "32 bits, or float32 (tifffile writes numpy's float64 as it is)"
+        ) from None
     except Exception as error:  # numpy and Pillow raise whatever they stumble over
         reason = " ".join(str(error).split())[:120]
         raise SessionError(f"{where} {path}: {reason}; accepted: .png, .tiff, .npy") from None

@@ -30,10 +30,14 @@ class ImageMessage:
 
 @dataclass(frozen=True)
 class CameraInfoMessage:
-    """Intrinsics of a camera. distorted: whether lens distortion was left in its images."""
+    """Intrinsics of a camera.
 
-    camera: PinholeCamera
+    distorted: whether lens distortion was left in its images as they were taken.
+    """
+
+    camera: PinholeCamera  # of its images as they were taken: K
     distorted: bool = False
+    rectified: PinholeCamera | None = None  # of rectified images: P
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +71,7 @@ class WrenchMessage:
 
 
 Joints = dict[str, float]
-"""Positions of joints by name, radians or metres."""
+"""Positions of joints by name, radians or metres; those that are not measured are not finite."""
 
 Content = (
     ImageMessage

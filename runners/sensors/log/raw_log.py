@@ -153,10 +153,18 @@ def log_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     found = sorted(path.glob("*.mcap"), key=_natural)
-    if not found:
+    names = {file.name for file in found}
+    packed = [file for file in path.glob("*.mcap.zst*") if file.stem not in names]
+    if packed:
         raise SessionError(
-            f"log {path} is a folder without .mcap files; {ACCEPTED}: others, and those compressed "
-            "by rosbag2, are converted by `ros2 bag convert`"
+            f"log {path} has {len(packed)} files that are compressed, such as {packed[0].name}; "
+            f"{ACCEPTED}: unpack them with `zstd -d FILE`, or convert it with `ros2 bag convert`"
+        )
+    if not found:
+        other = " but .db3, of sqlite3" if any(path.glob("*.db3")) else ""
+        raise SessionError(
+            f"log {path} is a folder without .mcap files{other}; {ACCEPTED}: others are converted "
+            "by `ros2 bag convert`"
         )
     return found
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -14,10 +15,12 @@ from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.problem.poses import compose, inverse, quaternions, rotation_matrices, slerp
 from runners.sensors.log.clocks import ClockCorrection
 from runners.sensors.log.messages import Joints, Received, TransformMessage
+from runners.sensors.log.motion import MotionLimits, check_motion
 
 _NANOSECONDS = 1e9
 _MOST_LISTED = 30
 _SAME = 1e-6  # metres, and parts of a rotation matrix
+_ELSEWHERE = 0.01  # the same: by which two poses at one time are contradictory
 
 MOVED = 0.01  # rad or m: by which a joint must move to make another hand
 MOST_OF_A_PROBE = 50
@@ -60,10 +63,41 @@ class TransformTree:
 
     def settle(self, clocks: ClockCorrection) -> None:
         """All transforms were added; their times are those by the clocks."""
-        for edge in self._edges.values():
+        for child, edge in self._edges.items():
             edge.settle(clocks)
+            if edge.is_static_and_moves():
+                self.faults[f"frame {child} is both static and moving; what moves counts"] += 1
+        self._gather_times()
+
+    def check_motions(self, world: str, frames: Iterable[str], limits: MotionLimits) -> list[str]:
+        """Leave out implausible samples of the transforms between frames and the world.
+
+        Returns what a user should know of them. Raises TransformError as `lookup` does.
+        """
+        paths = (self._path(world, frame) for frame in frames)
+        children = dict.fromkeys(child for path in paths for part in path for child in part)
+        remarks = [self._edges[child].check_motion(child, limits) for child in children]
+        self._gather_times()
+        return [remark for some in remarks for remark in some]
+
+    def jumps(self, target: str, source: str) -> IntArray:
+        """Times (J,), ascending, until which it is not known how a frame moved from the one before.
+
+        Raises TransformError as `lookup` does.
+        """
+        down, up = self._path(target, source)
+        times = [self._edges[child].jump_times() for child in (*down, *up)]
+        return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *times]))
+
+    def sent_once(self, target: str, source: str) -> list[str]:
+        """Transforms between two frames that are not static, and were sent a single time."""
+        down, up = self._path(target, source)
+        edges = {child: self._edges[child] for child in (*down, *up)}
+        return [f"{name} in {edge.parent}" for name, edge in edges.items() if len(edge.times) == 1]
+
+    def _gather_times(self) -> None:
         times = [edge.times for edge in self._edges.values()]
-        self.times = np.unique(np.concatenate([self.times, *times]))
+        self.times = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *times]))
 
     def lookup(self, target: str, source: str, stamp_ns: int, *, gap_s: float) -> FloatArray:
         """target_from_source (4, 4) at a time, nanoseconds.
@@ -78,6 +112,10 @@ class TransformTree:
             down, up = self._path(target, source)
             edges = [(child, self._edges[child]) for child in (*down, *up)]
             child, edge = next(one for one in edges if not one[1].at(stamps, gap_s)[1][0])
+            if len(edge.times) == 0:
+                raise TransformError(
+                    f"{target} from {source}: no sample is left: {'; '.join(edge.remarks)}"
+                )
             away = edge.nearest(stamp_ns)
             raise TransformError(
                 f"{target} from {source}: {child} in {edge.parent} is not known at "
@@ -147,6 +185,12 @@ class _Edge:
         self.times: IntArray = np.zeros(0, dtype=np.int64)  # (N,), rising
         self._positions: FloatArray = np.zeros((0, 3))
         self._quaternions: FloatArray = np.zeros((0, 4))
+        self._jumps: BoolArray = np.zeros(0, dtype=bool)  # (N,), before which there is a jump
+        self._contradicting: tuple[IntArray, FloatArray, FloatArray] | None = None
+        """Times, positions and quaternions of other poses at times (C,) of samples."""
+
+        self.remarks: list[str] = []  # on samples that are left out
+        self._topics: tuple[str, ...] = ()
         self._static: tuple[int, FloatArray] | None = None  # stamp, pose
         self._added: dict[str, tuple[array[int], array[int], array[float]]] = {}
         """The log's times, stamps and poses (4, 4) by topic."""
@@ -171,24 +215,72 @@ class _Edge:
             return
         times = [clocks.times(topic, *some[:2]) for topic, some in self._added.items()]
         numbers = np.concatenate([np.frombuffer(some[2]) for some in self._added.values()])
-        self.times, chosen = np.unique(np.concatenate(times), return_index=True)
-        poses = numbers.reshape(-1, 4, 4)[chosen]
+        every = np.concatenate(times)
+        self.times, chosen, sample = np.unique(every, return_index=True, return_inverse=True)
+        poses = numbers.reshape(-1, 4, 4)
+        apart = np.flatnonzero(
+            (np.abs(poses - poses[chosen][sample]) > _ELSEWHERE).any(axis=(1, 2))
+        )
+        if len(apart):
+            others = poses[apart]
+            self._contradicting = every[apart], others[:, :3, 3], quaternions(others[:, :3, :3])
+        poses = poses[chosen]
         self._positions, self._quaternions = poses[:, :3, 3], quaternions(poses[:, :3, :3])
+        self._jumps = np.zeros(len(self.times), dtype=bool)
+        self._topics = tuple(self._added)
         self._added.clear()
+
+    def is_static_and_moves(self) -> bool:
+        """Whether it is static in one place, and was also sent in another one."""
+        if self._static is None or len(self.times) == 0:
+            return False
+        return bool((np.abs(self._positions - self._static[1][:3, 3]) > _ELSEWHERE).any())
+
+    def check_motion(self, child: str, limits: MotionLimits) -> list[str]:
+        """Leave out samples that are not plausible; what a user should know of them."""
+        times, positions, turns = self.times, self._positions, self._quaternions
+        if self._contradicting is not None:
+            others, self._contradicting = self._contradicting, None
+            order = np.argsort(np.concatenate([times, others[0]]), kind="stable")
+            times = np.concatenate([times, others[0]])[order]
+            positions = np.concatenate([positions, others[1]])[order]
+            turns = np.concatenate([turns, others[2]])[order]
+
+        def distances(first: IntArray, second: IntArray) -> FloatArray:
+            away = np.sqrt(((positions[first] - positions[second]) ** 2).sum(axis=1))
+            same = np.abs((turns[first] * turns[second]).sum(axis=1))
+            return np.stack([away, 2.0 * np.arccos(np.minimum(same, 1.0))], axis=1)
+
+        blank = (positions == 0.0).all(axis=1) & (np.abs(turns[:, 3]) == 1.0)
+        found = check_motion(times, distances, limits, blank)
+        topics = " and ".join(self._topics)
+        remarks = found.remarks(f"{child} in {self.parent}, on {topics},", limits)
+        self.remarks += remarks
+        if remarks:
+            self._jumps = found.jumps[found.kept]
+            self._positions, self._quaternions = positions[found.kept], turns[found.kept]
+            self.times = times[found.kept]
+        return remarks
+
+    def jump_times(self) -> IntArray:
+        """Times (J,) of samples that the ones before them cannot have reached."""
+        return self.times[self._jumps]
 
     def at(self, stamps: IntArray, gap_s: float) -> tuple[FloatArray, BoolArray]:
         """Poses (N, 4, 4) at times (N,), and whether (N,) they are known."""
         known_at = self.times
         if len(known_at) == 0:
-            assert self._static is not None
-            return np.repeat(self._static[1][None], len(stamps), axis=0), np.ones(len(stamps), bool)
+            pose = np.eye(4) if self._static is None else self._static[1]
+            known = np.full(len(stamps), self._static is not None)
+            return np.repeat(pose[None], len(stamps), axis=0), known
         after = np.searchsorted(known_at, stamps)
         left = np.clip(after - 1, 0, len(known_at) - 1)
         right = np.clip(after, 0, len(known_at) - 1)
         left = np.where(known_at[right] == stamps, right, left)
         to_left = (stamps - known_at[left]) / _NANOSECONDS
         span = (known_at[right] - known_at[left]) / _NANOSECONDS
-        near = np.where(left == right, np.abs(to_left) <= gap_s, span <= gap_s)
+        bridged = (span <= gap_s) & ~self._jumps[right]
+        near = np.where(left == right, np.abs(to_left) <= gap_s, bridged)
         fraction = np.where(span > 0.0, np.clip(to_left / np.where(span > 0.0, span, 1.0), 0, 1), 0)
         first, second = self._positions[left], self._positions[right]
         position = first + fraction[:, None] * (second - first)
@@ -207,40 +299,80 @@ def _listed(names: list[str]) -> str:
 
 
 class JointHistory:
-    """Values of joints by time; a state holds until the next one."""
+    """Values of joints by time; a state holds until the next one.
 
-    def __init__(self, names: Sequence[str]) -> None:
-        """names: of the joints that matter."""
-        self._names = tuple(names)
+    faults: values that are not finite, with how often.
+    """
+
+    def __init__(self, names: Sequence[str], sliding: Collection[str] = ()) -> None:
+        """names: of the joints that matter. sliding: those of them that are prismatic."""
+        self._names, self._sliding = tuple(names), frozenset(sliding)
+        self.faults: Counter[str] = Counter()
         self._added: list[tuple[Received, Joints]] = []
-        self._states: list[tuple[int, Joints]] = []
+        self._repeated: Received | None = None  # the last message, where it said nothing new
+        self._states: list[tuple[int, Joints | None]] = []
+        """Times and positions; None: not known."""
 
     def add(self, received: Received, positions: Mapping[str, float]) -> None:
         """Positions of a message; joints that it does not name stay where they were."""
         last = self._added[-1][1] if self._added else {}
-        state = last | {name: positions[name] for name in self._names if name in positions}
+        known = {name: positions[name] for name in self._names if name in positions}
+        state = last | {name: value for name, value in known.items() if math.isfinite(value)}
+        self.faults.update(
+            f"{received.topic}: joint {name} is not a finite number; it counts as unmoved"
+            for name, value in known.items()
+            if not math.isfinite(value)
+        )
         if state.keys() != last.keys() or any(
             abs(state[name] - last[name]) > MOVED for name in state
         ):
+            if self._repeated is not None:
+                self._added.append((self._repeated, last))
             self._added.append((received, state))
+            self._repeated = None
+        else:
+            self._repeated = received
 
-    def settle(self, clocks: ClockCorrection) -> None:
-        """All positions were added; their times are those by the clocks."""
-        times = [(clocks.time(received), state) for received, state in self._added]
-        self._states = sorted(times, key=lambda state: state[0])
+    def settle(self, clocks: ClockCorrection, limits: MotionLimits) -> list[str]:
+        """All positions were added; their times are those by the clocks.
+
+        States that are not plausible are left out; returns what a user should know of them.
+        """
+        timed = [(clocks.time(received), state) for received, state in self._added]
+        timed.sort(key=lambda state: state[0])
+        values = np.array([[state.get(n, np.nan) for n in self._names] for _, state in timed])
+        values = values.reshape(len(timed), len(self._names))
+        slides = np.array([name in self._sliding for name in self._names], dtype=bool)
+
+        def distances(first: IntArray, second: IntArray) -> FloatArray:
+            apart = np.nan_to_num(np.abs(values[first] - values[second]))  # 0 if one is unknown
+            turned = np.abs((apart + np.pi) % (2.0 * np.pi) - np.pi)  # a joint may turn on and on
+            ways = np.where(slides, apart, 0.0), np.where(slides, 0.0, turned)
+            return np.stack([way.max(axis=1, initial=0.0) for way in ways], axis=1)
+
+        times = np.array([time for time, _ in timed], dtype=np.int64)
+        found = check_motion(times, distances, limits)
+        before: Joints | None = {}
+        for (time, state), kept, disputed in zip(timed, found.kept, found.disputed, strict=True):
+            chosen = None if disputed else state if kept else before
+            if chosen is not before:
+                self._states.append((time, chosen))
+            before = chosen
+        topics = " and ".join(dict.fromkeys(received.topic for received, _ in self._added))
+        return found.remarks(f"the hand's joints, on {topics},", limits)
 
     def first(self) -> Joints:
-        """The first state; empty if there is none."""
-        return self._added[0][1] if self._added else {}
+        """The first state that is known; empty if there is none."""
+        return next((state for _, state in self._states if state is not None), {})
 
-    def during(self, opens: int, closes: int) -> list[tuple[int, Joints]]:
+    def during(self, opens: int, closes: int) -> list[tuple[int, Joints | None]]:
         """States from a time to before another, with the times from which they hold.
 
-        The first one holds from `opens` on; of very many, some are left out.
+        The first one holds from `opens` on; of very many, some are left out. None: not known.
         """
         start = bisect_right(self._states, opens, key=lambda state: state[0]) - 1
         chosen = [state for state in self._states[max(start, 0) :] if state[0] < closes]
         if not chosen:
-            return [(opens, self.first())]
+            return [(opens, self._states[0][1] if self._states else {})]
         every = -(-len(chosen) // MOST_OF_A_PROBE)
         return [(opens, chosen[0][1]), *chosen[every::every]]

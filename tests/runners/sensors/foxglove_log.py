@@ -61,7 +61,8 @@ def _said_again(kind, said, packed):
             yield _made("RawImage", said, encoding=said.encoding, data=bytes(said.data), **size)
         case "CameraInfo":
             size = {"width": said.width, "height": said.height}
-            yield _made("CameraCalibration", said, K=list(said.k), D=list(said.d), **size)
+            matrices = {"K": list(said.k), "D": list(said.d), "P": list(said.p)}
+            yield _made("CameraCalibration", said, **matrices, **size)
         case "JointState":
             pairs = zip(said.name, said.position, strict=True)
             joints = [_made("JointState", name=name, position=value) for name, value in pairs]

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import compose, inverse
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.rig import BoxRig, BubbleRig, CameraRig, ContactRig, HandRig, Rig
@@ -46,11 +47,12 @@ RIG = Rig(
 MARKS = ((0.95, "begin 0"), (2.95, "end 0"), (3.05, "begin 1"), (4.95, "end 1"))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SphereLog:
     """How the log is written. marks: times in seconds and texts of the markers.
 
-    unit: metres of a unit of the camera's images. camera_clock: seconds by which it is ahead.
+    unit: metres of a unit of the camera's images. camera_clock: seconds by which it is ahead, from
+    camera_clock_set on. info: what its camera info has otherwise. camera_frame: its pose (4, 4).
     lost_transforms: seconds between which the hand sends none. left_out: topics without messages.
     finger: metres at which a joint of this name stands; None: no joint states. cloud: points
     (N, 3) in the lidar's frame, sent on /lidar and /skin before and in the first probe.
@@ -59,6 +61,9 @@ class SphereLog:
     marks: tuple[tuple[float, str], ...] = MARKS
     unit: float = 0.001
     camera_clock: float = 0.0
+    camera_clock_set: float = 0.0
+    info: tuple[tuple[str, object], ...] = ()
+    camera_frame: FloatArray | None = None
     lost_transforms: tuple[float, float] = (0.0, 0.0)
     left_out: tuple[str, ...] = ()
     finger: float | None = None
@@ -84,9 +89,10 @@ class SphereLog:
             joints = joint_state(["elbow", "finger"], [seconds, self.finger], stamp)
             self._add(writer, "/joint_states", "sensor_msgs/JointState", joints, stamp)
         if tick == 0:
+            camera = WORLD_FROM_CAMERA if self.camera_frame is None else self.camera_frame
             fixed = [
                 transform("hand", "pad_frame", HAND_FROM_PAD, stamp),
-                transform("world", "camera_frame", WORLD_FROM_CAMERA, stamp),
+                transform("world", "camera_frame", camera, stamp),
                 transform("world", "lidar", compose(np.eye(3), LIDAR), stamp),
             ]
             self._add(writer, "/tf_static", "tf2_msgs/TFMessage", {"transforms": fixed}, stamp)
@@ -94,10 +100,13 @@ class SphereLog:
         if tick % 2 == 0:
             images.append(("pad", INNER, membrane(hand).astype(np.float32), stamp))
         if tick % 10 == 0:
-            ahead = stamp + round(self.camera_clock * SECOND)
+            is_ahead = seconds >= self.camera_clock_set
+            ahead = stamp + round(is_ahead * self.camera_clock * SECOND)
             images.append(("camera", OUTER, np.rint(seen() / self.unit).astype(np.uint16), ahead))
         for name, camera, values, seen_at in images:
             info = camera_info(f"{name}_frame", camera, seen_at)
+            if name == "camera":
+                info |= dict(self.info)
             self._add(writer, f"/{name}/info", "sensor_msgs/CameraInfo", info, stamp)
             depth = image(f"{name}_frame", values, seen_at)
             self._add(writer, f"/{name}/depth", "sensor_msgs/Image", depth, stamp)

@@ -1,8 +1,10 @@
 import dataclasses
 import json
+import struct
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 from PIL import Image
 
@@ -14,14 +16,24 @@ from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
 from chsel.sensing.depth_camera import one_per_voxel
 from runners.command.choices import CONF
+from runners.objects.loader import ObjectModel
 from runners.sensors.depth_frame import depth_frame_points, read_depth_frame
 from runners.sensors.rig import GateRig, Rig
+from runners.sessions.sensors import SensorsSettings, open_sensors
 
+MODEL = ObjectModel("box", trimesh.creation.box((0.15, 0.1, 0.05)), 1.0, 0.001, "box")
 WIDTH, HEIGHT = 80, 60
 INTRINSICS = {"fx": 100.0, "fy": 110.0, "cx": 39.5, "cy": 29.5}
 BOX = (slice(20, 40), slice(30, 60))  # pixels of a box that faces the camera
 FRONT, WALL = 0.5, 0.9  # m
 POSE = [[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+def far(metres):
+    """A pose (4, 4) so far away."""
+    pose = np.eye(4)
+    pose[0, 3] = metres
+    return pose.tolist()
 
 
 def rig(**camera):
@@ -80,6 +92,77 @@ def test_a_frame_is_read_with_all_its_parts(tmp_path):
     for name in ("depth.npy", "depth.tiff"):
         frame = read_depth_frame(written(tmp_path, depth=name, depth_scale=None))
         np.testing.assert_array_equal(frame.depth, metres.astype(float))
+
+
+def tiff(values, sample_format):
+    """A TIFF of one strip, little endian. sample_format: 1 unsigned, 2 signed, 3 floating point."""
+    height, width = values.shape
+    data, bits = values.tobytes(), 8 * values.itemsize
+    tags = {256: width, 257: height, 258: bits, 259: 1, 262: 1, 273: 8, 277: 1, 278: height}
+    tags |= {279: len(data), 339: sample_format}
+    entries = [struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items()]
+    start = struct.pack("<2sHI", b"II", 42, 8 + len(data))
+    return start + data + struct.pack("<H", len(tags)) + b"".join(entries) + bytes(4)
+
+
+def test_whole_numbers_of_a_tiff_are_what_they_are(tmp_path):
+    stored = np.full((HEIGHT, WIDTH), 3_000_000_000, dtype="<u4")  # above 2^31
+    (tmp_path / "depth.tiff").write_bytes(tiff(stored, 1))
+    frame = read_depth_frame(written(tmp_path, depth="depth.tiff", depth_scale=1e-9))
+    np.testing.assert_allclose(frame.depth, 3.0)
+    signed = np.where(np.arange(WIDTH) < 9, -1, 2000).astype("<i4") + np.zeros((HEIGHT, 1), "<i4")
+    (tmp_path / "depth.tiff").write_bytes(tiff(signed, 2))
+    frame = read_depth_frame(written(tmp_path, depth="depth.tiff"))
+    assert sorted(set(frame.depth.reshape(-1))) == [-0.001, 2.0]
+    (tmp_path / "depth.tiff").write_bytes(tiff(np.full((HEIGHT, WIDTH), 0.5, "<f8"), 3))
+    with pytest.raises(SessionError, match=r"or float32 \(tifffile writes numpy's float64"):
+        read_depth_frame(written(tmp_path, depth="depth.tiff"))
+
+
+@pytest.mark.parametrize("number", ["1e-3", "1E-3", "+1.e-3", ".1e-2", "0.001", "1.0e-3"])
+def test_numbers_of_yaml_are_those_of_json(tmp_path, number):
+    path = written(tmp_path)
+    path.write_text(path.read_text().replace('"depth_scale": 0.001', f"depth_scale: {number}"))
+    assert read_depth_frame(path).depth[30, 45] == FRONT
+    path.write_text(path.read_text().replace(f"depth_scale: {number}", "depth_scale: e3"))
+    with pytest.raises(SessionError, match=r"depth_scale is 'e3'"):
+        read_depth_frame(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, None),
+        ({"world_from_camera": far(0.98)}, None),
+        (
+            {"world_from_camera": far(980.0)},
+            "world_from_camera is 980 m from the origin; check",
+        ),
+        (
+            {"world_from_object": far(980.0)},
+            "world_from_object is 980 m from the origin; check",
+        ),
+        (
+            {"intrinsics": INTRINSICS | {"cx": 29.5, "cy": 39.5}},
+            "camera: cx 29.5 and cy 39.5 look exchanged, as its images have 80 x 60 pixels",
+        ),
+    ],
+)
+def test_what_is_suspicious_is_told(tmp_path, changes, said):
+    settings = SensorsSettings(rig(), str(written(tmp_path, **changes)))
+    session = open_sensors(settings, MODEL, 0)
+    assert list(session.probes())
+    told = [text for level, text in session.report.lines if level == "warning"]
+    assert [text[: len(said or "")] for text in told] == ([said] if said else [])
+
+
+def test_a_camera_that_looks_past_the_workspace_is_told(tmp_path):
+    past = dataclasses.replace(rig(), workspace=((3.0, 3.4), (0.0, 0.4), (0.0, 0.4)))
+    path = written(tmp_path, label=None, object_class=None)
+    session = open_sensors(SensorsSettings(past, str(path)), MODEL, 0)
+    assert list(session.probes())
+    told = [text for level, text in session.report.lines if level == "warning"]
+    assert [text[:40] for text in told] == ["camera: its rays miss the workspace; che"]
 
 
 @pytest.mark.parametrize(

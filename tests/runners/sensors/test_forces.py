@@ -72,6 +72,20 @@ def write_log(path, *, torque=True, settled=0.0, lacks=""):
     return path
 
 
+def test_forces_that_give_no_contact_are_told(tmp_path):
+    path = write_log(tmp_path / "log.mcap")
+    counts, _, told = read(path)
+    assert counts.contacts > 0
+    assert "/wrench: no" not in told
+    counts, _, told = read(path, forces=(replace(FORCES, threshold=50.0),))
+    largest = np.sqrt((FORCE**2).sum())
+    assert f"no contact in 201 messages: their largest force is {largest:.3g} N, the thresh" in told
+    elsewhere = HandRig("hand", boxes=(BoxRig((0.04, 0.06, 0.02), (0.0, 0.3, 0.05)),))
+    counts, _, told = read(path, hand=elsewhere)
+    assert counts.contacts == 0
+    assert f"none of {counts.outside} lines of force meets the hand in the workspace" in told
+
+
 def read(path, **changes):
     """What the forces gave, and what is known then; changes: of the rig."""
     session, (probe,), told = small_logs.read(path, replace(RIG, **changes))

@@ -1,5 +1,6 @@
 """Sessions of raw logs: known answers, and logs that lack something."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from chsel.errors import SessionError, SettingError
 from chsel.events import Logged, Probe, RigDescribed, SensorImage
-from chsel.problem.poses import apply
+from chsel.problem.poses import apply, compose, inverse
+from runners.sensors.first_pass import RECTIFIED
 from runners.sensors.pose_file import beside, write_pose
 from runners.sensors.rig import Annotations, CloudRig, ExtraContacts, HandRig, ProbeTimes
 from runners.sessions.sensors import SensorsSession, SensorsSettings
@@ -293,6 +295,100 @@ def test_a_camera_whose_clock_is_ahead_is_put_right(tmp_path, events):
         assert one.new_points.digest == other.new_points.digest
 
 
+@pytest.mark.parametrize("step", [-4.4, 4.4])
+def test_a_camera_whose_clock_is_set_is_put_right(tmp_path, events, step):
+    log = SphereLog(camera_clock=step, camera_clock_set=2.4).write(tmp_path / "log.mcap")
+    found = list(open_log(log).probes())
+    assert f"stamps on /camera/depth start again or jump .* by {step:+g} s" in re.sub(
+        "against the log's clock,", ".*", lines(found)
+    )
+    for one, other in zip(probes(found), probes(events), strict=True):
+        assert one.new_points.digest == other.new_points.digest
+
+
+K = [1.5 * OUTER.fx, 0.0, OUTER.cx, 0.0, 1.5 * OUTER.fy, OUTER.cy, 0.0, 0.0, 1.0]
+
+
+def test_rectified_images_are_of_the_projection_matrix(tmp_path, log, events):
+    """What the camera sees has the intrinsics P; K are those of images that are distorted."""
+    wrong = SphereLog(info=(("k", K), ("d", [0.1]))).write(tmp_path / "log.mcap")
+    raw = list(open_log(wrong).probes())
+    assert "camera: K and P of its camera info differ, and topic /camera/depth does not" in lines(
+        raw
+    )
+    assert heights(free_of(raw)).min() < heights(free_of(events)).min() - 0.005  # in the sphere
+    rectified = replace(RIG, cameras=(replace(RIG.cameras[0], rectified=True),))
+    found = list(open_log(wrong, rectified).probes())
+    assert "camera info" not in lines(found)
+    for one, other in zip(probes(found), probes(events), strict=True):
+        assert one.new_points.digest == other.new_points.digest
+    plain = list(
+        open_log(log, replace(RIG, cameras=(replace(RIG.cameras[0], rectified=False),))).probes()
+    )
+    for one, other in zip(probes(plain), probes(events), strict=True):
+        assert one.new_points.digest == other.new_points.digest
+
+
+@pytest.mark.parametrize(
+    ("topic", "is_rectified"),
+    [
+        ("/camera/depth/image_rect_raw", True),
+        ("/rect/depth", True),
+        ("/depth/image_rectified", True),
+        ("/cam/image_rect/compressedDepth", True),
+        ("/camera/direct", False),
+        ("/corrected/image_raw", False),
+    ],
+)
+def test_topics_of_rectified_images_by_the_convention_of_ros(topic, is_rectified):
+    assert (RECTIFIED.search(topic) is not None) == is_rectified
+
+
+def test_exchanged_coordinates_of_the_principal_point_are_noticed(tmp_path, events):
+    swapped = [OUTER.fx, 0.0, OUTER.cy, 0.0, OUTER.fy, OUTER.cx, 0.0, 0.0, 1.0]
+    log = SphereLog(info=(("k", swapped), ("p", [0.0] * 12))).write(tmp_path / "log.mcap")
+    told = lines(open_log(log).probes())
+    assert "camera: cx 35.5 and cy 47.5 look exchanged, as its images have 96 x 72" in told
+    assert "exchanged" not in lines(events)
+
+
+BODY = compose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+
+
+def test_a_sensor_that_gives_next_to_nothing_warns(tmp_path, events):
+    assert "check" not in lines(events)
+    body = WORLD_FROM_CAMERA @ inverse(BODY)  # x forward, as of a camera's housing
+    told = lines(open_log(SphereLog(camera_frame=body).write(tmp_path / "log.mcap")).probes())
+    assert "camera: its rays miss the workspace; check its frame, which must be the optical" in told
+    assert "(all of 11 images)" in told
+    elsewhere = replace(RIG, workspace=((5.0, 5.4), (-0.2, 0.2), (0.3, 0.6)))
+    told = lines(open_log(SphereLog().write(tmp_path / "log.mcap"), elsewhere).probes())
+    assert "camera: its rays miss the workspace" in told
+    assert "pad: its 42 images give no contact and no free voxel; check its frame" in told
+    assert "hand: none of its 101 poses brings it into the workspace" in told
+    cloud = ((0.1, 0.1, 0.1),)
+    log = SphereLog(cloud=cloud, marks=((3.0, "begin 0"), (4.0, "end 0"))).write(
+        tmp_path / "log.mcap"
+    )
+    clouds = CloudRig("/lidar", "rays"), CloudRig("/skin", "contacts")
+    told = lines(open_log(log, replace(elsewhere, clouds=clouds)).probes())
+    assert "/lidar: its rays miss the workspace, their points are in the first message" in told
+    assert "/skin: none of its 2 messages was of use: 2 outside of probes" in told
+    empty = SphereLog(cloud=((np.nan, 0.0, 0.0),)).write(tmp_path / "log.mcap")
+    told = lines(open_log(empty, replace(RIG, clouds=clouds)).probes())
+    assert "/lidar: its 2 messages have no point that is finite" in told
+
+
+def test_a_pose_that_is_lost_mostly_is_told_with_its_reason(tmp_path):
+    log = SphereLog(lost_transforms=(0.1, 1.9)).write(tmp_path / "log.mcap")
+    told = lines(open_log(log).probes())
+    assert "pad: 18 of 51 poses of pad_frame are not known, and left out: world from pad_f" in told
+    log = SphereLog(lost_transforms=(0.05, 9.9)).write(tmp_path / "log.mcap")
+    told = lines(open_log(log).probes())
+    assert "hand in world was sent once, which counts for 0.5 s; accepted: on tf_static" in told
+    assert "pad: 45 of 51 poses of pad_frame are not known, and left out: hand in world" in told
+
+
 def test_a_pose_beside_the_log_is_the_true_one(tmp_path):
     log = SphereLog().write(tmp_path / "log.mcap")
     assert open_log(log).world_from_object is None
@@ -301,7 +397,15 @@ def test_a_pose_beside_the_log_is_the_true_one(tmp_path):
     write_pose(beside(log), pose, {})
     session = open_log(log)
     np.testing.assert_array_equal(session.world_from_object, pose)
-    assert "the true pose is that of log.pose.yaml" in lines(session.probes(), "info")
+    events = list(session.probes())
+    assert "the true pose is that of log.pose.yaml" in lines(events, "info")
+    assert "workspace" not in lines(events)
+    pose[:3, 3] *= 1000.0
+    write_pose(beside(log), pose, {}, overwrite=True)
+    told = lines(open_log(log).probes())
+    assert "pose of log.pose.yaml is 1e+03 m outside of the workspace; check its unit" in told
+    pose[:3, 3] = CENTRE
+    write_pose(beside(log), pose, {}, overwrite=True)
     assert open_log(log, pose="none").world_from_object is None
     with pytest.raises(SessionError, match=r"other.yaml: cannot be read"):
         open_log(log, pose=str(tmp_path / "other.yaml"))

@@ -17,7 +17,7 @@ from runners.sensors.log.messages import (
     WrenchMessage,
 )
 from runners.sensors.log.raw_log import RawLog
-from runners.simulated_robot.log_writer import image
+from runners.simulated_robot.log_writer import image, transform
 from tests.runners.sensors.foxglove_log import in_foxgloves_messages
 from tests.runners.sensors.small_logs import BEGIN, SECOND, depth, png, ros2_sent, write_ros2, xyz
 
@@ -30,13 +30,14 @@ def moved(x, y, z):
     return pose
 
 
+CAMERA = PinholeCamera(5, 3, 400.0, 410.0, 2.0, 1.0)
 CONTENTS: dict[str, Content] = {  # of step 3
     "/tf_static": TransformMessage("base", "camera", moved(0, 0, 1), static=True),
     "/tf": TransformMessage("world", "base", moved(3, 0, 0)),
     "/depth": ImageMessage("camera", depth(3)),
     "/compressed": ImageMessage("camera", depth(3)),
     "/quantised": ImageMessage("camera", (100.0 / (depth(3) + 20.0)).astype(np.float32)),
-    "/info": CameraInfoMessage(PinholeCamera(5, 3, 400.0, 410.0, 2.0, 1.0)),
+    "/info": CameraInfoMessage(CAMERA, rectified=CAMERA),
     "/pose": TransformMessage("base", "", TURNED),
     "/poses": CloudMessage("base", np.array([[1.0, 2, 3], [1, 2, 3]])),
     "/point": CloudMessage("base", np.array([[1.0, 0, 2]])),
@@ -111,6 +112,16 @@ def test_broken_messages_are_counted_with_their_topic(tmp_path):
     assert "a force or torque is not finite" in said
 
 
+def test_of_several_transforms_only_the_broken_one_is_left_out(tmp_path):
+    parts = [transform("base", name, moved(x, 0, 0), 5) for name, x in (("a", np.nan), ("b", 1))]
+    sent = [("/tf", "tf2_msgs/TFMessage", {"transforms": parts}, 9)]
+    write_ros2(tmp_path / "log.mcap", sent)
+    log = RawLog(tmp_path / "log.mcap")
+    (received,) = log.messages(["/tf"])
+    assert_same(received.content, TransformMessage("base", "b", moved(1, 0, 0)))
+    assert list(log.faults.values()) == [1]
+
+
 def test_intrinsics_are_those_of_the_pixels_that_are_sent(tmp_path):
     topic, kind, message, log_time = next(one for one in ros2_sent(1) if one[0] == "/info")
     sent = {
@@ -118,6 +129,7 @@ def test_intrinsics_are_those_of_the_pixels_that_are_sent(tmp_path):
         "width": 640,
         "height": 480,
         "k": [400.0, 0.0, 320.0, 0.0, 410.0, 240.0, 0.0, 0.0, 1.0],
+        "p": [800.0, 0.0, 300.0, 9.0, 0.0, 820.0, 200.0, 0.0, 0.0, 0.0, 1.0, 0.0],
         "d": [0.0, 0.1],
         "binning_x": 2,
         "binning_y": 4,
@@ -126,7 +138,39 @@ def test_intrinsics_are_those_of_the_pixels_that_are_sent(tmp_path):
     write_ros2(tmp_path / "log.mcap", [(topic, kind, sent, log_time)])
     camera = PinholeCamera(160, 60, 200.0, 102.5, 110.0, 50.0)
     content = by_topic(tmp_path / "log.mcap")["/info"].content
-    assert content == CameraInfoMessage(camera, distorted=True)
+    rectified = PinholeCamera(160, 60, 400.0, 205.0, 100.0, 40.0)
+    assert content == CameraInfoMessage(camera, distorted=True, rectified=rectified)
+
+
+@pytest.mark.parametrize(
+    "k",
+    [
+        [400.0, 0.0, 0.0, 0.0, 410.0, 0.0, 2.0, 1.0, 1.0],  # by columns
+        [800.0, 0.0, 4.0, 0.0, 820.0, 2.0, 0.0, 0.0, 2.0],
+        [400.0, 0.0, 2.0, 0.0, 410.0, 1.0, 0.0, 0.0, 0.0],
+        [400.0, 9.0, 2.0, 0.0, 410.0, 1.0, 0.0, 0.0, 1.0],
+        [400.0, 0.0, float("nan"), 0.0, 410.0, 1.0, 0.0, 0.0, 1.0],
+    ],
+)
+@pytest.mark.parametrize("foxglove", [False, True])
+def test_a_matrix_that_is_none_of_a_camera_is_refused(tmp_path, k, foxglove):
+    topic, kind, message, log_time = next(one for one in ros2_sent(1) if one[0] == "/info")
+    path = tmp_path / "log.mcap"
+    write_ros2(path, [(topic, kind, {**message, "k": k}, log_time)])
+    if foxglove:
+        path = in_foxgloves_messages(path, tmp_path / "again.mcap", packed=True)
+    log = RawLog(path)
+    assert not list(log.messages(log.topics))
+    listed = ", ".join(f"{value:g}" for value in k)
+    expected = f"/info: K is [{listed}]; accepted: fx, 0, cx, 0, fy, cy, 0, 0, 1"
+    assert list(log.faults) == [expected]
+
+
+def test_a_rectified_matrix_that_is_none_does_not_matter(tmp_path):
+    topic, kind, message, log_time = next(one for one in ros2_sent(1) if one[0] == "/info")
+    for p in ([0.0] * 12, [float("nan")] * 12, [*range(1, 13)]):
+        write_ros2(tmp_path / "log.mcap", [(topic, kind, {**message, "p": p}, log_time)])
+        assert by_topic(tmp_path / "log.mcap")["/info"].content == CameraInfoMessage(CAMERA)
 
 
 VALUES = np.random.default_rng(0).integers(0, 2**16, (4, 7)).astype(np.uint16)
@@ -141,9 +185,21 @@ def test_rows_of_pixels(encoding, kind, big_endian, padding):
     found = pixel_rows(rows.tobytes(), encoding, (7, 4), rows.shape[1], big_endian=big_endian)
     assert found.dtype == np.dtype(kind)
     np.testing.assert_array_equal(found, VALUES)
-    for size, step in (((7, 5), rows.shape[1]), ((7, 4), 7)):
+    for size, step in (((7, 5), rows.shape[1]), ((7, 3), 0)):
         with pytest.raises(UnusableMessage, match=f"cannot have {rows.size} bytes"):
             pixel_rows(rows.tobytes(), encoding, size, step)
+
+
+@pytest.mark.parametrize("step", [0, 1280, 2**32 - 1])
+def test_rows_without_gaps_need_no_length(step):
+    np.testing.assert_array_equal(pixel_rows(VALUES.tobytes(), "16UC1", (7, 4), step), VALUES)
+    points = np.arange(18.0).reshape(6, 3)
+    fields = {name: (8 * k, 8) for k, name in enumerate("xyz")}
+    for size in ((6, 1), (3, 2)):
+        found = packed_points(points.tobytes(), fields, 24, size=size, row=step)
+        np.testing.assert_array_equal(found, points)
+    with pytest.raises(UnusableMessage, match="cannot have 144 bytes"):
+        packed_points(points.tobytes(), fields, 24, size=(5, 1), row=step)
 
 
 @pytest.mark.parametrize(

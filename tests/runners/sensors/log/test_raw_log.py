@@ -4,11 +4,16 @@ import hashlib
 
 import numpy as np
 import pytest
+import zstandard
+from mcap.reader import make_reader
 from mcap.writer import CompressionType
+from mcap.writer import Writer as PlainWriter
+from mcap_ros2.writer import Writer
 
 from chsel.errors import SessionError
 from replay.files import file_digest
 from runners.sensors.log.raw_log import RawLog
+from runners.sensors.log.ros2_definitions import full_definition
 from tests.runners.sensors.small_logs import ros2_sent, write_ros2
 
 
@@ -51,7 +56,8 @@ def test_messages_come_in_order_of_log_time(tmp_path):
     ("name", "content", "message"),
     [
         ("log.mcap", b"", r"log\.mcap is not an MCAP file"),
-        ("log.mcap", b"SQLite format 3\0", r"log\.mcap is not an MCAP file"),
+        ("log.db3", b"SQLite format 3\0", r"is a rosbag2 file in sqlite3; .*`ros2 bag convert`"),
+        ("log.mcap.zst", b"\x28\xb5\x2f\xfd\0\0\0\0", r"compressed by zstd; .*: .*`zstd -d FILE`"),
         ("log.bag", b"#ROSBAG V2.0\n", r"is a ROS 1 bag; accepted: .*`rosbags-convert --src"),
         ("none.mcap", None, r"none\.mcap does not exist"),
         ("", None, r"without \.mcap files; accepted.*`ros2 bag convert`"),
@@ -62,6 +68,58 @@ def test_what_is_no_log_is_an_error(tmp_path, name, content, message):
         (tmp_path / name).write_bytes(content)
     with pytest.raises(SessionError, match=message):
         RawLog(tmp_path / name)
+
+
+def test_a_folder_with_packed_files_is_not_read_in_part(tmp_path):
+    write_ros2(tmp_path / "bag_1.mcap", ros2_sent(1))
+    (tmp_path / "bag_0.mcap.zstd").write_bytes(b"")
+    with pytest.raises(SessionError, match=r"has 1 files that are compressed, such as bag_0\.mcap"):
+        RawLog(tmp_path)
+    write_ros2(tmp_path / "bag_0.mcap", ros2_sent(1))
+    assert len(RawLog(tmp_path).files) == 2
+    for file in tmp_path.iterdir():
+        file.unlink()
+    (tmp_path / "bag_0.db3").write_bytes(b"SQLite format 3\0")
+    with pytest.raises(SessionError, match=r"without \.mcap files but \.db3, of sqlite3"):
+        RawLog(tmp_path)
+
+
+@pytest.mark.parametrize("finished", [True, False])
+@pytest.mark.parametrize("checked", [True, False])
+def test_an_unknown_compression_is_named(tmp_path, finished, checked):
+    """checked: whether chunks have checksums."""
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        options = {"chunk_size": 500, "compression": CompressionType.ZSTD, "enable_crcs": checked}
+        writer = Writer(file, **options)
+        text = writer.register_msgdef("std_msgs/msg/String", full_definition("std_msgs/String"))
+        for number in range(100):
+            writer.write_message("/probe", text, {"data": f"begin {number}"}, number)
+        if finished:
+            writer.finish()
+    path.write_bytes(path.read_bytes().replace(b"\x04\0\0\0zstd", b"\x04\0\0\0snap"))
+    said = "a chunk is compressed by 'snap'; accepted: zstd, lz4, or none"
+    with pytest.raises(SessionError, match=said):
+        RawLog(path).messages(["/probe"])
+
+
+def test_messages_that_rosbag2_compressed_are_named(tmp_path):
+    path, packed = tmp_path / "plain.mcap", tmp_path / "bag_0.mcap"
+    write_ros2(path, ros2_sent(2))
+    with path.open("rb") as file, packed.open("wb") as out:
+        writer = PlainWriter(out)
+        writer.start()
+        for schema, channel, message in make_reader(file).iter_messages(["/tf"]):
+            number = writer.register_schema(schema.name, schema.encoding, schema.data)
+            number = writer.register_channel(channel.topic, channel.message_encoding, number)
+            data = zstandard.ZstdCompressor().compress(message.data)
+            writer.add_message(number, message.log_time, data, message.publish_time)
+        writer.finish()
+    log = RawLog(packed)
+    assert not list(log.messages(["/tf"]))
+    ((fault, count),) = log.faults.items()
+    assert count == 2
+    assert "/tf: its messages are compressed one by one by rosbag2" in fault
 
 
 def test_a_cut_file_gives_what_is_before_the_cut(tmp_path):

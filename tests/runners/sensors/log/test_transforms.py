@@ -9,6 +9,7 @@ from chsel.problem.poses import axis_angle, compose, inverse, random_rotations, 
 from runners.sensors.log.clocks import ClockCorrection
 from runners.sensors.log.decoding import rigid
 from runners.sensors.log.messages import Received, TransformMessage
+from runners.sensors.log.motion import MotionLimits
 from runners.sensors.log.transforms import (
     MOST_OF_A_PROBE,
     JointHistory,
@@ -146,7 +147,7 @@ def history(*positions):
     joints = JointHistory(["finger"])
     for index, values in enumerate(positions):
         joints.add(Received("/joints", 10 * index, None, ""), values)
-    joints.settle(ClockCorrection())
+    joints.settle(ClockCorrection(), MotionLimits(3.0, 10.0))
     return joints
 
 
