@@ -118,8 +118,8 @@ def trust_in(
         firsts = [poses[part[:1]] for part in parts]
         cost = min(motion_cost(problem, first, sensor_noise, width) for first in firsts)
         if cost <= NEAR_LIMIT * LIMIT:
-            why = f"moved by {1000.0 * width:.1f} mm it is {cost:.1f} nats less likely, wide up to "
-            why += f"{LIMIT:g}"
+            least = max(cost, 0.0)
+            why = f"moving it {1000.0 * width:.1f} mm costs {least:.1f} nats, wide up to {LIMIT:g}"
         verdict = WIDE if cost <= LIMIT else DETERMINED if count == 1 else SEVERAL
         count = 0 if verdict == WIDE else count
     misfit, spread = error / sensor_noise, surface_spread(apart)

@@ -189,7 +189,8 @@ class _SessionAgain:
                     given = (problem.points, self._result, problem.key)
                     problem = replace(problem, belief=self._steering.belief(*given))
                 if problem.verdict:  # which earlier recordings do not have
-                    problem = replace(problem, verdict=self._verdict)
+                    verdict = "" if self._result is None else self._verdict
+                    problem = replace(problem, verdict=verdict)
                 decision = self._steering.policy.decide(problem if anew else decided.problem)
                 felt = decided.surprise if self._surprise is None else self._surprise
                 again = Decided(decided.step, problem, decision, felt)
