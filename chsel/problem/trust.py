@@ -115,8 +115,8 @@ def trust_in(
     elif max(surface_spread(apart[np.ix_(part, part)]) for part in parts) > width:
         count, verdict = 0, WIDE
     else:
-        firsts = [poses[part[:1]] for part in parts]
-        cost = min(motion_cost(problem, first, sensor_noise, width) for first in firsts)
+        bests = [poses[part[:1]] for part in parts]
+        cost = min(motion_cost(problem, pose, sensor_noise, width) for pose in bests)
         if cost <= NEAR_LIMIT * LIMIT:
             least = max(cost, 0.0)
             why = f"moving it {1000.0 * width:.1f} mm costs {least:.1f} nats, wide up to {LIMIT:g}"
