@@ -220,7 +220,7 @@ class PoseBelief:
         for mode in self.modes[:3]:
             size = 1000.0 * mode.deviations[0]
             x, y, z = inverse(mode.object_from_world)[:3, 3]
-            place = f"at [{x:.3f}, {y:.3f}, {z:.3f}] m, centre within {size:.1f} mm"
+            place = f"at [{x:.3f}, {y:.3f}, {z:.3f}] m, its centre deviates by {size:.1f} mm"
             lines.append(f"mode {mode.number}: {100.0 * mode.weight:.0f} %, {place}")
         if len(self.modes) > 3:
             lines.append(f"and {len(self.modes) - 3} more")

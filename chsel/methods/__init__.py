@@ -7,6 +7,7 @@ from typing import Any
 
 from chsel.errors import require_choice
 from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
+from chsel.methods.anchored.pose_bound import pose_bound
 from chsel.methods.chsel import Chsel, ChselSettings
 from chsel.methods.cvo import Cvo, CvoSettings
 from chsel.methods.gradient_descent import GradientDescent, GradientDescentSettings
@@ -27,6 +28,7 @@ from chsel.problem.trust import (
     MANY_CONTACTS,
     SENSOR_NOISE,
     WIDE,
+    explaining,
     fits_elsewhere,
     has_pose,
     trust_in,
@@ -82,13 +84,14 @@ def trust_by(method: Method, problem: RegistrationProblem, hypotheses: Hypothese
     A single mode has to stand beside what a search for other poses finds, among them turns under
     which the object looks nearly alike, and poses that leave out one of few contacts. Of many
     contacts, `anchored` has done this search itself. Where pushes may have moved the object, also
-    beside what is found for other distances of them.
+    beside what is found for other distances of them. How far the pose may be off is in
+    `centre_within` and `turn_within`, by `pose_bound`.
     """
     if not has_pose(hypotheses):
         return None
     noise, pushes, posed = noise_of(method), problem.pushes, problem
     problem = posed.carried(hypotheses.push_distance)
-    trust = trust_in(problem, hypotheses, noise)
+    trust, rivals = trust_in(problem, hypotheses, noise), None
     searched = isinstance(method, Anchored) and len(problem.points.known) >= MANY_CONTACTS
     if trust.verdict == DETERMINED and not searched:
         rivals = Anchored(AnchoredSettings(noise=noise)).minima(problem)
@@ -98,5 +101,8 @@ def trust_by(method: Method, problem: RegistrationProblem, hypotheses: Hypothese
         others = [posed.carried(distance) for distance in pushes.distances]
         found = ((other, search.minima(other)) for other in others)
         if any(fits_elsewhere(problem, hypotheses, *one, noise) for one in found):
-            trust = replace(trust, verdict=WIDE, modes=0)
-    return trust
+            reason = "pushes of another length fit elsewhere"
+            trust = replace(trust, verdict=WIDE, modes=0, reason=reason)
+    poses, _ = explaining(problem, hypotheses, noise, rivals)
+    centre, turn = pose_bound(problem.sdf, poses)
+    return replace(trust, centre_within=centre, turn_within=turn)

@@ -13,6 +13,7 @@ from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, digest, froze
 from chsel.numerics.compiler import compiled
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import check_rigid
+from chsel.problem.registration_problem import VERDICTS
 from chsel.problem.sdf_grid import FARTHEST, SdfGrid
 from chsel.problem.streams import StreamKey
 
@@ -183,9 +184,11 @@ class DecisionProblem:
     available: BoolArray  # (A,): which of them can be taken now
     hand: HandShape
     key: StreamKey  # of the random streams; its step is the number of probes done
+    verdict: str = ""  # on the result that the belief is of, one of VERDICTS; "" if there is none
 
     def __post_init__(self) -> None:
         require_positive("free_resolution", self.free_resolution)
+        require_choice("verdict", self.verdict, ("", *VERDICTS))
         flags = frozen(
             "available", self.available, (len(self.actions),), dtype=np.bool_, error=SettingError
         )
@@ -198,7 +201,8 @@ class DecisionProblem:
         text = np.frombuffer("".join(part.digest for part in parts).encode(), dtype=np.uint8)
         numbers = np.array([*self.workspace.lower, *self.workspace.upper, self.free_resolution])
         key = np.array([self.key.seed, self.key.step], dtype=np.uint64)
-        return digest(text, numbers, self.available, key)
+        verdict = [np.array([float(VERDICTS.index(self.verdict))])] if self.verdict else []
+        return digest(text, numbers, self.available, key, *verdict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,10 @@ from chsel.next_probe.decision_problem import Decision, DecisionProblem
 from chsel.next_probe.forecast import BeliefSettings, Forecast, SurpriseSettings
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.settings import CheckedSettings, at_most, not_negative, positive
+from chsel.problem.trust import DETERMINED, MOST_WIDTH
 
 MOST_PROBES = 100_000
+LEAST_GAIN = 0.001  # diameters that a probe has to promise
 
 
 class Policy(Protocol):
@@ -31,8 +33,27 @@ class Policy(Protocol):
 class StopSettings(CheckedSettings):
     """When no further probe is made. 0 switches a rule off."""
 
-    spread: Annotated[float, not_negative] = 0.010  # of the belief, at most, metres
-    gain: Annotated[float, not_negative] = 0.0005  # promised by the best action, at least, metres
+    # Of the belief, at most, metres; None: as soon as the result is determined. Where the verdict
+    # on the result is known, it has to be determined in any case.
+    spread: Annotated[float | None, not_negative] = None
+    # Promised by the best action, at least, metres; None: LEAST_GAIN diameters of the object.
+    gain: Annotated[float | None, not_negative] = None
+
+    def is_narrow(self, spread: float, diameter: float, verdict: str) -> bool:
+        """Whether to stop by the spread of a belief, metres, on an object of a diameter, metres.
+
+        verdict: on the result that the belief is of, "" if there is none.
+        """
+        if self.spread == 0.0 or verdict not in ("", DETERMINED):
+            return False
+        if self.spread is None:
+            return verdict == DETERMINED or spread <= MOST_WIDTH * diameter
+        return spread <= self.spread
+
+    def is_useless(self, promised: float, diameter: float) -> bool:
+        """Whether to stop as the best action promises so little, metres."""
+        least = LEAST_GAIN * diameter if self.gain is None else self.gain
+        return 0.0 < least > promised
 
 
 @dataclass(frozen=True)
@@ -89,12 +110,12 @@ class ConfiguredPolicy(Generic[Settings]):
 
     def _stop(self, problem: DecisionProblem, forecast: Forecast, feasible: BoolArray) -> str:
         """Why no probe is made, "" if one is."""
-        settings = self.settings
-        if problem.key.step >= settings.probes:
+        stop, diameter = self.settings.stop, problem.sdf.diameter
+        if problem.key.step >= self.settings.probes:
             return "budget"
-        if settings.stop.spread > 0.0 and forecast.spread <= settings.stop.spread:
+        if stop.is_narrow(forecast.spread, diameter, problem.verdict):
             return "spread"
         if not feasible.any():
             return "actions"
         promised = forecast.spread - float(forecast.gains.expected_spread[feasible].min())
-        return "gain" if 0.0 < settings.stop.gain > promised else ""
+        return "gain" if stop.is_useless(promised, diameter) else ""

@@ -60,7 +60,9 @@ class Steering:
         key = StreamKey(self.seed, done)
         known = self.sdf, points, self.workspace, self.free_resolution
         belief = self.belief(points, hypotheses, key)
-        problem = DecisionProblem(*known, belief, self.actions, available, self.hand, key)
+        trust = None if hypotheses is None else hypotheses.trust
+        verdict = "" if trust is None else trust.verdict
+        problem = DecisionProblem(*known, belief, self.actions, available, self.hand, key, verdict)
         decision = self.policy.decide(problem)
         _check(problem, decision)
         self.last = Choice(problem, decision)

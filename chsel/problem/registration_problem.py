@@ -11,6 +11,7 @@ import numpy as np
 
 from chsel.errors import PoseError, SettingError, require_between, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, ShapesShown, digest, frozen
+from chsel.problem.noise import FREEDOMS, PRIOR_CONTACTS, PRIOR_OUTLIERS
 from chsel.problem.points import KnownPoints, Workspace, require_parts
 from chsel.problem.poses import check_rigid, inverse
 from chsel.problem.pushes import Pushes
@@ -119,26 +120,56 @@ class Trust:
     # Largest angle (radians) between modes whose surfaces are as near as those of one mode, and
     # the distance of these surfaces (m); None for other modes.
     twins: tuple[float, float] | None = None
+    limit: float | None = None  # of the spread, above which a result is wide, metres
+    # The farthest of the hypotheses that explain the points is so far off the best: the object's
+    # centre, metres, and turned, radians, but for symmetries. See `chsel.methods.trust_by`.
+    centre_within: float | None = None
+    turn_within: float | None = None
+    reason: str = ""  # why the verdict is wide, or nearly so, where the spread does not show it
 
     def __str__(self) -> str:
         """One line for people."""
-        modes = {0: "", 1: "1 mode, "}.get(self.modes, f"{self.modes} modes, ")
-        exact = ": no evidence, a pose can fit so few contacts exactly"
-        if self.redundancy or self.verdict == "nothing fits":
-            exact = ""
         verdict = self.verdict
         if self.twins is not None:
             angle, apart = math.degrees(self.twins[0]), 1000.0 * self.twins[1]
             verdict = f"determined up to a turn of {angle:.0f} degrees, {apart:.1f} mm apart"
-        return (
-            f"{verdict} ({modes}spread {1000.0 * self.spread:.1f} mm, noise "
-            f"{1000.0 * self.noise:.1f} mm, {100.0 * self.outliers:.0f} % outliers, misfit "
-            f"{self.misfit:.1f} noise levels{exact})"
-        )
+        return f"{verdict} ({', '.join(self._details)}){self._bound}"
+
+    @property
+    def _details(self) -> list[str]:
+        """Texts of the numbers behind the verdict, without those that few contacts cannot show."""
+        texts = [f"{self.modes} mode{'s' if self.modes > 1 else ''}"] if self.modes else []
+        most = "" if self.limit is None else f" of {1000.0 * self.limit:.1f}"
+        texts.append(f"spread {1000.0 * self.spread:.1f}{most} mm")
+        texts += [self.reason] if self.reason else []
+        misfit = f"misfit {self.misfit:.1f} noise levels"
+        if not self.redundancy and self.verdict != "nothing fits":
+            return [*texts, f"{misfit}: no evidence, a pose can fit so few contacts exactly"]
+        texts.append(f"noise {1000.0 * self.noise:.1f} mm")
+        total = PRIOR_CONTACTS + FREEDOMS + self.redundancy
+        outliers = round(self.outliers * total - PRIOR_CONTACTS * PRIOR_OUTLIERS)
+        texts += [f"{outliers} outlier{'s' if outliers > 1 else ''}"] if outliers > 0 else []
+        return [*texts, misfit]
+
+    @property
+    def _bound(self) -> str:
+        """How far the pose may be off, rounded up; "" where that is not known."""
+        if self.centre_within is None or self.turn_within is None or self.verdict == "nothing fits":
+            return ""
+        off = math.ceil(10_000.0 * self.centre_within) / 10.0
+        angle = math.ceil(math.degrees(self.turn_within))
+        if self.verdict == "wide":
+            return f", centre off by up to {off:.1f} mm and {angle}° or more"
+        return f", centre within {off:.1f} mm, {angle}°"
 
     @property
     def numbers(self) -> dict[str, float]:
         """As recordings have it, the verdict as the number of its place in VERDICTS."""
+        later = {
+            "spread_limit": self.limit,
+            "centre_within": self.centre_within,
+            "turn_within": self.turn_within,
+        }
         return {
             "estimated_noise": self.noise,
             "outlier_share": self.outliers,
@@ -146,7 +177,7 @@ class Trust:
             "modes": float(self.modes),
             "set_spread": self.spread,
             "verdict": float(VERDICTS.index(self.verdict)),
-        }
+        } | {name: value for name, value in later.items() if value is not None}
 
 
 @dataclass(frozen=True, eq=False)

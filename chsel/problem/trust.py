@@ -52,6 +52,7 @@ MOST_OUTLIERS = 0.3  # share
 MOST_MODES = 8  # sets of more are wide
 MOST_LEVELS = 10.0  # sensor noise levels that errors may have without a warning
 LEAST_LEVELS = 3.0  # sensor noise levels that errors and widths may have on small objects
+NEAR_LIMIT = 1.5  # times LIMIT that moving a pose costs, below which the result says so
 LEAST_GAP = 2.0  # noise levels, as estimated, between modes
 SYSTEMATIC = 0.5  # correlation of the errors of neighbours
 MOST_NOISE = 0.015  # metres: contacts that are off by more, or three times the sensor's noise
@@ -65,7 +66,7 @@ _LEAST_CORRELATED = 8  # points
 
 _MOST_HYPOTHESES = 100  # that are compared, the best ones
 _MOST_CORRELATED = 300
-_SOFT = 1e-4  # added to A, see can_be_moved: of (m / m)^2
+_SOFT = 1e-4  # added to A, see motion_cost: of (m / m)^2
 _ROUNDS = 4  # of the subspace iteration
 _LEAST_LENGTH = 1e-3  # of a motion of the surface, of the object's motion
 _MOST_KNOWN, _MOST_FREE = 1000, 5000
@@ -87,7 +88,8 @@ def trust_in(
     """
     require_positive("sensor_noise", sensor_noise)
     problem = problem.carried(hypotheses.push_distance)
-    (poses, indices), sdf, points = _compared(hypotheses), problem.sdf, problem.points
+    sdf, points = problem.sdf, problem.points
+    poses, indices = explaining(problem, hypotheses, sensor_noise, rivals)
     off = signed_distances(sdf, poses[:1], points.known)[0] - points.sdf
     noise = estimate_noise(off, sensor_noise)
     most = FOREIGN * noise.sigma
@@ -96,43 +98,71 @@ def trust_in(
     share = MOST_SYSTEMATIC if alike else MOST_OFF
     limit = max(share * sdf.diameter, _GRID_ERROR * sdf.resolution, LEAST_LEVELS * sensor_noise)
 
-    own = len(poses)
-    if rivals is not None:
-        poses = Poses.joined([poses, rivals])
-        indices = np.concatenate([indices, np.full(len(rivals), -1)])
-    energies = pose_energies(problem, poses, noise_model(sensor_noise))
-    allowed = np.full(len(poses), energies.min() + LIMIT)
-    if len(points.known) < MANY_CONTACTS:
-        allowed[own:] += FOREIGN_CONTACT
-    explaining = energies <= allowed
-    explaining[0] = True
-    poses, indices = poses[explaining], indices[explaining]
     apart = outline_distances(sdf, poses)
     width = max(MOST_WIDTH * sdf.diameter, LEAST_LEVELS * sensor_noise)
     gap = max(width, LEAST_GAP * noise.sigma)
     near = apart <= gap
     count, mode = _components(near & ~turned(sdf, poses, near))
     parts = [np.flatnonzero(mode == one) for one in range(count)]
-    redundancy = max(len(off) - FREEDOMS, 0)
+    redundancy, why = max(len(off) - FREEDOMS, 0), ""
     worst = max(MOST_NOISE, LEAST_LEVELS * sensor_noise)
     if error > limit or noise.outliers > MOST_OUTLIERS or noise.sigma > worst:
         count, verdict = 0, NOTHING
-    elif (
-        redundancy + len(points.free) + len(points.occupied) == 0
-        or count > MOST_MODES
-        or max(surface_spread(apart[np.ix_(part, part)]) for part in parts) > width
-        or any(can_be_moved(problem, poses[part[:1]], sensor_noise, width) for part in parts)
-    ):
+    elif redundancy + len(points.free) + len(points.occupied) == 0:
+        count, verdict, why = 0, WIDE, "no more contacts than a pose can fit"
+    elif count > MOST_MODES:
+        count, verdict, why = 0, WIDE, f"{count} groups of poses"
+    elif max(surface_spread(apart[np.ix_(part, part)]) for part in parts) > width:
         count, verdict = 0, WIDE
     else:
-        verdict = DETERMINED if count == 1 else SEVERAL
+        bests = [poses[part[:1]] for part in parts]
+        cost = min(motion_cost(problem, pose, sensor_noise, width) for pose in bests)
+        if cost <= NEAR_LIMIT * LIMIT:
+            least = max(cost, 0.0)
+            why = f"moving it {1000.0 * width:.1f} mm costs {least:.1f} nats, wide up to {LIMIT:g}"
+        verdict = WIDE if cost <= LIMIT else DETERMINED if count == 1 else SEVERAL
+        count = 0 if verdict == WIDE else count
     misfit, spread = error / sensor_noise, surface_spread(apart)
     firsts = [int(indices[part[0]]) for part in parts[: max(count, 1)]]
     best = tuple(index for index in firsts if index >= 0)
     twins = _largest_turn(poses, apart, parts) if verdict == SEVERAL and near.all() else None
     return Trust(
-        noise.sigma, noise.outliers, misfit, count, spread, verdict, redundancy, best, twins
+        noise.sigma,
+        noise.outliers,
+        misfit,
+        count,
+        spread,
+        verdict,
+        redundancy,
+        best,
+        twins,
+        limit=width,
+        reason=why,
     )
+
+
+def explaining(
+    problem: RegistrationProblem,
+    hypotheses: Hypotheses,
+    sensor_noise: float,
+    rivals: Poses | None = None,
+) -> tuple[Poses, IntArray]:
+    """The poses (K, 12) that explain the points, the best hypothesis first, and their indices (K,).
+
+    Arguments and errors as of `trust_in`, but that no push is left; the index of a rival is -1.
+    """
+    poses, indices = _compared(hypotheses)
+    own = len(poses)
+    if rivals is not None:
+        poses = Poses.joined([poses, rivals])
+        indices = np.concatenate([indices, np.full(len(rivals), -1)])
+    energies = pose_energies(problem, poses, noise_model(sensor_noise))
+    allowed = np.full(len(poses), energies.min() + LIMIT)
+    if len(problem.points.known) < MANY_CONTACTS:
+        allowed[own:] += FOREIGN_CONTACT
+    likely = energies <= allowed
+    likely[0] = True
+    return poses[likely], indices[likely]
 
 
 def fits_elsewhere(
@@ -162,7 +192,7 @@ def turned(sdf: SdfGrid, poses: Poses, pairs: BoolArray) -> BoolArray:
     one, other = np.nonzero(np.triu(pairs & (_angles(poses) > TURN), 1))
     result = np.zeros_like(pairs)
     turns = product(poses.rotations[one], np.swapaxes(poses.rotations[other], 1, 2))
-    outline, centre = outline_in_object(sdf), sdf.derived("middle", lambda: _middle(sdf))
+    outline, centre = outline_in_object(sdf), middle(sdf)
     about = Poses.of(compose(turns, centre - rotated(turns, centre)))
     squares = in_order(signed_distances(sdf, about, outline) ** 2) / max(len(outline), 1)
     moved = np.sqrt(squares) > SYMMETRIC * sdf.diameter
@@ -170,8 +200,12 @@ def turned(sdf: SdfGrid, poses: Poses, pairs: BoolArray) -> BoolArray:
     return result | result.T
 
 
-def _middle(sdf: SdfGrid) -> FloatArray:
+def middle(sdf: SdfGrid) -> FloatArray:
     """Centroid (3,) of the object's volume, which every symmetry leaves where it is."""
+    return sdf.derived("middle", lambda: _middle(sdf))
+
+
+def _middle(sdf: SdfGrid) -> FloatArray:
     share = np.clip(0.5 - sdf.values / sdf.resolution, 0.0, 1.0)  # of the cell around each node
     inside = np.argwhere(share > 0.0)
     if len(inside) == 0:
@@ -293,11 +327,12 @@ def _components(adjacent: BoolArray) -> tuple[int, IntArray]:
     return count, part
 
 
-def can_be_moved(
+def motion_cost(
     problem: RegistrationProblem, pose: Poses, sensor_noise: float, distance: float
-) -> bool:
-    """Whether the points stay about as likely if the object's surface moves by a distance, metres.
+) -> float:
+    """How much less likely the points are if the object's surface moves by a distance, metres.
 
+    In nats, of the likeliest such motion; infinite if there is none. Up to LIMIT they stay likely.
     A set of hypotheses may leave out what its method has not found. So the best pose is moved along
     the motions that contacts resist the least for how far they move the surface: the largest
     solutions of M v = lambda A v, with the mean squares v^T A v by which contacts leave the surface
@@ -306,12 +341,12 @@ def can_be_moved(
     """
     motions = _loosest_motions(problem, pose)
     if len(motions) == 0:
-        return False
+        return math.inf
     moved = _moved(problem, pose, distance * np.concatenate([motions, -motions]))
     energies = pose_energies(problem, Poses.joined([pose, moved]), noise_model(sensor_noise))
     apart = outline_distances_to(problem.sdf, moved, pose)  # near for turns that are symmetries
-    likely = (energies[1:] - energies[0] <= LIMIT) & (apart >= 0.5 * distance)
-    return bool(likely.any())
+    rises = energies[1:] - energies[0]
+    return float(rises[apart >= 0.5 * distance].min(initial=math.inf))
 
 
 def _loosest_motions(problem: RegistrationProblem, pose: Poses) -> FloatArray:

@@ -123,6 +123,7 @@ class _SessionAgain:
         # Today's last result, which is not known where it was not made again.
         self._result: Hypotheses | None = None
         self._result_known = True
+        self._verdict = ""  # on it
         self._surprise: float | None = 0.0  # of the last probe, None if it cannot be known
         self._before: Decided | None = None
         self._truth = recording.start.world_from_object
@@ -187,6 +188,9 @@ class _SessionAgain:
                 if self._result_known:
                     given = (problem.points, self._result, problem.key)
                     problem = replace(problem, belief=self._steering.belief(*given))
+                if problem.verdict:  # which earlier recordings do not have
+                    verdict = "" if self._result is None else self._verdict
+                    problem = replace(problem, verdict=verdict)
                 decision = self._steering.policy.decide(problem if anew else decided.problem)
                 felt = decided.surprise if self._surprise is None else self._surprise
                 again = Decided(decided.step, problem, decision, felt)
@@ -216,5 +220,7 @@ class _SessionAgain:
             if self._anew:
                 raise
             return Again(self._name, recorded, recorder.events, str(error))
+        trust = registered.hypotheses.trust
+        self._verdict = "" if trust is None else trust.verdict
         today = [ProblemPosed(step, problem), *recorder.events[1:]]
         return Again(self._name, recorded, today, seconds=registered.seconds)

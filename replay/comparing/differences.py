@@ -230,7 +230,7 @@ def _stages(event: Event) -> dict[str, Content]:
             belief = {name: values.pop(name) for name in [*values] if name.startswith("belief")}
             made = [part.name for part in fields(event.decision)] + ["surprise"]
             stages = {name.replace("_", " "): {name: values[name]} for name in made}
-            return {"belief": belief, **stages}
+            return {"belief": belief | {"verdict": values["verdict"]}, **stages}
     return {}
 
 

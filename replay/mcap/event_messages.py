@@ -303,6 +303,7 @@ def _decision_values(event: Decided) -> dict[str, Any]:
         "key_step": problem.key.step,
         "problem_digest": problem.digest,
         "surprise": float(event.surprise),
+        "verdict": problem.verdict,
     }
 
 
@@ -335,6 +336,7 @@ class RecordedDecision:
             available=values["available"],
             hand=offered.hand,
             key=StreamKey(values["key_seed"], values["key_step"]),
+            verdict=values["verdict"],
         )
         what = f"the problem of the decision of step {self.step}"
         check_digest(what, problem.digest, values["problem_digest"])

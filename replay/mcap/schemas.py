@@ -31,6 +31,7 @@ from replay.mcap.validation import (
     session_end,
     short_names,
     stop_reason,
+    verdict,
     voxel_side,
 )
 
@@ -199,6 +200,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "contacts": "f8[N,3]",
         "digest": "string",  # of chosen to contacts
         "surprise": ("double", finite),
+        "verdict": ("string", verdict),
     },
     "Belief": {
         "step": "sint32",

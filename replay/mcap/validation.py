@@ -74,6 +74,13 @@ def stop_reason(field: str, value: str) -> None:
     one_of(*STOPS)(field, value)
 
 
+def verdict(field: str, value: str) -> None:
+    """On the result that a decision follows, "" if there is none."""
+    from chsel.problem.registration_problem import VERDICTS
+
+    one_of("", *VERDICTS)(field, value)
+
+
 def sensor_name(field: str, value: str) -> None:
     """A word, as it is a part of names of files and topics."""
     check_name(field, value)

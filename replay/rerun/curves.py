@@ -18,6 +18,9 @@ _MEASURED = {  # where measured numbers are drawn, by part of their names, and t
     "rotation_error": ("error/rotation", DEGREES),
     "estimated_noise": ("trust", MILLIMETRES),
     "set_spread": ("trust", MILLIMETRES),
+    "spread_limit": ("trust", MILLIMETRES),
+    "centre_within": ("trust", MILLIMETRES),
+    "turn_within": ("measured", DEGREES),
     "": ("measured", 1.0),
 }
 _OF_HYPOTHESES = "distinct_hypotheses"  # a measured number that the hypotheses show

@@ -76,9 +76,20 @@ def verdict_markdown(values: Mapping[str, float], known: int) -> str:
     if verdict not in range(len(VERDICTS)) or not math.isfinite(modes):
         return ""
     named, redundancy = VERDICTS[int(verdict)], max(known - FREEDOMS, 0)
-    trust = Trust(noise, outliers, misfit, int(modes), spread, named, redundancy)
+    trust = Trust(
+        noise,
+        outliers,
+        misfit,
+        int(modes),
+        spread,
+        named,
+        redundancy,
+        limit=values.get("spread_limit"),
+        centre_within=values.get("centre_within"),
+        turn_within=values.get("turn_within"),
+    )
     _, _, reasons = str(trust).partition("(")
-    return f"# {trust.verdict}\n\n{reasons.rstrip(')')}\n"
+    return f"# {trust.verdict}\n\n{reasons.replace(')', '')}\n"
 
 
 def literal(text: Any) -> str:

@@ -115,8 +115,10 @@ def _row(
         if hypotheses.trust is not None:
             pose, at = scene.session.world_from_object, StreamKey(seed, session.step)
             row |= belief_numbers(session.belief, scene.mesh, scene.sdf, pose, at)
+    trust = None if found is None else found.trust
+    verdict = "" if trust is None else trust.verdict
     if after is None:
-        return row | {"stop": usual_stop(row["spread"], None)}
+        return row | {"stop": usual_stop(row["spread"], None, scene.sdf.diameter, verdict)}
     spread, promised = after.decision.spread, promised_gain(after.decision)
     return row | {
         "spread": spread,
@@ -124,7 +126,7 @@ def _row(
         "surprise": numbers["surprise"],
         "decision_seconds": numbers["seconds_by_stage"].get("decision"),
         "decision_digest": after.decision.digest,
-        "stop": usual_stop(spread, promised) or after.decision.stop,
+        "stop": usual_stop(spread, promised, scene.sdf.diameter, verdict) or after.decision.stop,
     }
 
 
@@ -182,9 +184,12 @@ def promised_gain(decision: Decision) -> float | None:
     return decision.spread - float(spreads.min()) if len(spreads) else None
 
 
-def usual_stop(spread: float, promised: float | None) -> str:
-    """Why a session would end by the rules that policies have by default; "" if it goes on."""
+def usual_stop(spread: float, promised: float | None, diameter: float, verdict: str) -> str:
+    """Why a session would end by the rules that policies have by default; "" if it goes on.
+
+    spread, promised: of the belief and by the best action, metres. diameter: of the object.
+    """
     rules = StopSettings()
-    if spread <= rules.spread:
+    if rules.is_narrow(spread, diameter, verdict):
         return "spread"
-    return "gain" if promised is not None and promised < rules.gain else ""
+    return "gain" if promised is not None and rules.is_useless(promised, diameter) else ""

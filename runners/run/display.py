@@ -18,7 +18,7 @@ from chsel.errors import InputWarning
 from chsel.numerics.compiler import watched
 from chsel.policies.steering import Steering
 from chsel.problem.poses import quaternions
-from chsel.problem.registration_problem import Trust
+from chsel.problem.registration_problem import VERDICTS, Trust
 from chsel.session import FROM_SESSION, Session, StepWarning
 from replay.console import Console, Progress, TextColumn, plain_table
 from runners.sensors.session_report import Report
@@ -30,11 +30,13 @@ MEANINGS = {
     "nothing fits": "no pose explains the points; see the warning",
 }
 STOPPED = {
-    "spread": "the plausible poses are as close together as policy.stop.spread asks for",
-    "gain": "no probe promises to bring them closer by policy.stop.gain",
+    "spread": "the pose is determined, as closely as policy.stop.spread asks for",
+    "gain": "no probe promises to bring the poses closer by policy.stop.gain",
     "actions": "no probe is left that can be made",
     "budget": "policy.probes allows no more",
 }
+_JUDGED = {"set_spread": 1000.0, "centre_within": 1000.0, "turn_within": math.degrees(1.0)}
+"""Columns of the table of registrations, in units of the table."""
 _COUNTS = {
     "images": "images",
     "used": "used",
@@ -95,10 +97,10 @@ class Display:
         """Why a steered session has ended, if it has by its policy."""
         if steering.last is not None and steering.last.decision.stop:
             problem, decision = steering.last
-            self.say(
-                f"stopped after {problem.key.step} probes: {STOPPED[decision.stop]} (spread "
-                f"{1000.0 * decision.spread:.1f} mm)"
-            )
+            text = f"stopped after {problem.key.step} probes: {STOPPED[decision.stop]}"
+            if problem.verdict not in ("", VERDICTS[0]):
+                text += f"; the pose is not determined ({problem.verdict})"
+            self.say(text)
 
     def grasped(self, session: Session) -> None:
         """That touching has ended as a grasp works, and where it is."""
@@ -110,11 +112,8 @@ class Display:
         """A probe, and the registration after it if there was one, are done."""
         text = f"probe {row['step']:>3} {row['outcome']:<7} {row['contacts']:>3} contacts"
         text += f" {row['free_points']:>6} free"
-        if "best_cost" in row:
-            text += f"  cost {row['best_cost']:<8.3g}"
-            text += "" if "spread" in row else f" {row['distinct']:>2} distinct"
-        if "spread" in row:
-            text += f" spread {1000.0 * row['spread']:3.0f} mm"
+        if "set_spread" in row:
+            text += f"  spread {1000.0 * row['set_spread']:5.1f} mm  {row['verdict']:<14}"
         self.say(f"{text} {row['seconds']:>5.2f} s")
 
     def warn(self, warnings: Iterable[InputWarning | StepWarning]) -> None:
@@ -142,11 +141,14 @@ class Display:
                 "best hypothesis, closest one by its surface"
             )
         errors = ["mm", "°", "mm", "°"] if truth else []
-        table = plain_table(title, numbers=["probe", "contacts", "best cost", *errors, "time"])
+        numbers = ["probe", "contacts", "spread", "within mm", "°", *errors, "time"]
+        table = plain_table(title, numbers=numbers)
         table.pad_edge = True  # only lines about a probe begin with "probe"
         table.add_column("verdict", no_wrap=True)
         for row in rows:
-            cells = [str(row["step"]), str(row["contacts"]), f"{row['best_cost']:.4g}"]
+            cells = [str(row["step"]), str(row["contacts"])]
+            for name, scale in _JUDGED.items():
+                cells.append(f"{scale * row[name]:.1f}" if name in row else "")
             for which in ("best", "closest") if truth else ():
                 cells.append(f"{1000.0 * row[f'{which}_position_error']:.1f}")
                 cells.append(f"{math.degrees(row[f'{which}_rotation_error']):.1f}")
@@ -200,4 +202,4 @@ class Display:
     def verdict(self, trust: Trust | None) -> None:
         """How far to trust the last result, if there is one."""
         if trust is not None:
-            self.say(f"{trust}: {MEANINGS[trust.verdict]}")
+            self.say(f"{MEANINGS[trust.verdict]}: {trust}")

@@ -16,9 +16,11 @@ from scipy.spatial.transform import Rotation
 import chsel
 from chsel.errors import MeshError
 from chsel.events import Believed, Logged, Measured
+from chsel.methods import trust_by
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import object_symmetry
 from replay.comparing.beliefs import Beliefs
+from replay.comparing.choices import recorded_method
 from replay.mcap.reader import read_recording
 from runners import probe
 from runners.command.choices import CONF
@@ -67,7 +69,8 @@ def test_recorded_errors_are_modulo_symmetries(finished):
     assert [event.step for event in measured] == [0, 1, 2]
     for event in measured:
         found, problem = recording.hypotheses(event.step), recording.problem(event.step)
-        truth, trust = recording.start.world_from_object, chsel.trust_in(problem, found)
+        truth = recording.start.world_from_object
+        trust = trust_by(recorded_method(recording).build(), problem, found)
         expected = result_numbers(found, problem, truth, symmetry, trust)
         assert event.values == pytest.approx(expected, abs=1e-6)
 
@@ -75,7 +78,8 @@ def test_recorded_errors_are_modulo_symmetries(finished):
 def test_trust_is_on_the_terminal_in_the_summary_and_in_the_log(finished):
     folder, done = finished
     recording = read_recording(folder / "recording.mcap")
-    trusts = [chsel.trust_in(recording.problem(n), recording.hypotheses(n)) for n in range(3)]
+    method = recorded_method(recording).build()
+    trusts = [trust_by(method, recording.problem(n), recording.hypotheses(n)) for n in range(3)]
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["trust"] == json.loads(json.dumps(asdict(trusts[2])))
     assert [step["verdict"] for step in summary["steps"]] == [trust.verdict for trust in trusts]
@@ -84,7 +88,7 @@ def test_trust_is_on_the_terminal_in_the_summary_and_in_the_log(finished):
     table = [line for line in done.stdout.splitlines() if line.rstrip().endswith(trusts[0].verdict)]
     assert table[0].split()[:2] == ["0", "5"]
     shown = " ".join(done.stdout.split())
-    assert shown.rpartition(f"{trusts[2]}: ")[2] in set(MEANINGS.values())
+    assert shown.endswith(f" {MEANINGS[trusts[2].verdict]}: {trusts[2]}")
 
 
 def test_recorded_beliefs_follow_from_the_recorded_results(finished):

@@ -116,9 +116,11 @@ def check_decision(row, recording):
 
 
 def test_the_usual_rules_stop_at_a_narrow_belief_or_where_little_is_promised():
-    assert usual_stop(0.004, 0.05) == "spread"
-    assert usual_stop(0.1, 0.0001) == "gain"
-    assert usual_stop(0.1, 0.05) == usual_stop(0.1, None) == ""
+    assert usual_stop(0.005, 0.05, 0.2, "") == "spread"
+    assert usual_stop(0.005, 0.05, 0.2, "determined") == "spread"
+    assert usual_stop(0.005, 0.05, 0.2, "wide") == ""
+    assert usual_stop(0.005, 0.0001, 0.2, "wide") == "gain"
+    assert usual_stop(0.1, 0.05, 0.2, "wide") == usual_stop(0.1, None, 0.2, "wide") == ""
 
 
 def believed(sdf, world_from_object):

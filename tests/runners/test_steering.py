@@ -1,11 +1,13 @@
 import json
+import re
 
 import numpy as np
 import pytest
 
 from chsel.errors import SettingError
-from chsel.events import Believed, Decided, Probe
+from chsel.events import Believed, Decided, Measured, Probe
 from chsel.policies.steering import Steering
+from chsel.problem.registration_problem import VERDICTS
 from replay.comparing.verification import EQUAL, verify
 from replay.mcap.reader import read_recording
 from runners import probe
@@ -38,7 +40,8 @@ def test_every_probe_follows_a_decision_and_the_last_decision_says_why_it_ends(i
     decisions = decided(recording)
     assert [event.step for event in decisions] == [-1, 0, 1, 2]
     assert [event.decision.stop for event in decisions] == ["", "", "", "budget"]
-    assert "stopped after 3 probes: policy.probes allows no more" in " ".join(done.stdout.split())
+    shown = " ".join(done.stdout.split())
+    assert "stopped after 3 probes: policy.probes allows no more; the pose is not " in shown
     probes = [event for event in recording.events() if isinstance(event, Probe)]
     actions = decisions[0].problem.actions
     for before, made in zip(decisions, probes, strict=False):
@@ -59,12 +62,26 @@ def test_registration_begins_with_the_first_contact(informed):
     assert informed[1].steps == tuple(range(touched[0], 3))
 
 
-def test_a_session_stops_when_the_plausible_poses_are_close_together(tmp_path):
-    done, recording, _ = steered(tmp_path, "policy=information", "policy.stop.spread=0.1")
-    last = decided(recording)[-1]
-    assert last.decision.stop == "spread"
-    assert last.decision.spread <= 0.1 < decided(recording)[-2].decision.spread
-    assert "policy.stop.spread" in done.stdout
+def test_a_session_stops_by_the_spread_at_the_first_result_that_is_determined(tmp_path):
+    done, recording, summary = steered(tmp_path, "policy=information", "policy.stop.spread=0.1")
+    *before, last = decided(recording)
+    assert (last.decision.stop, last.problem.verdict) == ("spread", "determined")
+    assert last.decision.spread <= 0.1
+    assert "determined" not in {event.problem.verdict for event in before}
+    assert any(event.decision.spread <= 0.1 for event in before)  # not yet determined
+    measured = {event.step: event for event in recording.events() if isinstance(event, Measured)}
+    for event in [*before, last]:
+        verdict = event.problem.verdict
+        if event.step in measured:
+            assert measured[event.step].values["verdict"] == VERDICTS.index(verdict)
+        else:
+            assert verdict == ""
+    shown = " ".join(done.stdout.split())
+    assert "policy.stop.spread" in shown
+    assert "is not determined" not in shown
+    trust = summary["trust"]
+    assert f"spread {1000.0 * trust['spread']:.1f} of {1000.0 * trust['limit']:.1f} mm" in shown
+    assert re.search(r"\), centre within \d+\.\d mm, \d+°$", shown)
 
 
 def test_a_session_ends_with_a_sure_grasp_and_says_how_sure_it_is_of_each_mode(tmp_path):

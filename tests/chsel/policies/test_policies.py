@@ -8,9 +8,11 @@ from chsel.next_probe.decision_problem import Actions
 from chsel.next_probe.first_contact import touched_points
 from chsel.next_probe.forecast import Forecast
 from chsel.policies import POLICIES, build_policy
+from chsel.policies.policy import StopSettings
 from chsel.policies.voxel_entropy import filled_points, occupancy_entropy, voxel_box
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import apply, axis_angle, compose, inverse
+from chsel.problem.registration_problem import VERDICTS
 from tests.chsel.next_probe.decisions import (
     RADIUS,
     WORKSPACE,
@@ -113,6 +115,52 @@ def test_no_gain_is_promised_by_an_action_that_cannot_be_taken():
         flags = np.isin(np.arange(4), available)
         decision = policy.decide(ball_problem(TWO, actions, available=flags))
         assert (decision.chosen, decision.stop) == (chosen, stop)
+
+
+@pytest.mark.parametrize(
+    ("spread", "verdict", "stop"),
+    [
+        (None, "", "spread"),  # 3 % of the diameter
+        (None, "determined", "spread"),
+        (None, "several modes", ""),
+        (None, "wide", ""),
+        (None, "nothing fits", ""),
+        (0.05, "wide", ""),
+        (0.05, "determined", "spread"),
+        (0.05, "", "spread"),
+        (0.0, "determined", ""),
+        (1e-4, "determined", ""),
+    ],
+)
+def test_a_session_ends_by_the_spread_where_the_result_is_determined_alone(spread, verdict, stop):
+    """Two places of a ball 2 mm apart."""
+    policy = build_policy("information", {"stop": {"spread": spread, "gain": 0.0}})
+    problem = ball_problem(at((0.0, 0.0, 0.0), (0.002, 0.0, 0.0)), along_x([(0.0, 0.0)]))
+    assert policy.decide(replace(problem, verdict=verdict)).stop == stop
+
+
+@pytest.mark.parametrize("scale", [0.3, 1.0, 3.0])
+def test_rules_to_stop_grow_with_the_object(scale):
+    rules = StopSettings()
+    diameter = 0.2 * scale
+    assert rules.is_narrow(0.0299 * diameter, diameter, "")
+    assert not rules.is_narrow(0.0301 * diameter, diameter, "")
+    assert rules.is_narrow(0.1, diameter, "determined")  # the verdict itself is relative
+    assert rules.is_useless(0.00099 * diameter, diameter)
+    assert not rules.is_useless(0.00101 * diameter, diameter)
+    recorded = StopSettings(spread=0.010, gain=0.0005)
+    assert recorded.is_narrow(0.0099, diameter, "")
+    assert recorded.is_useless(0.00049, diameter)
+    assert not recorded.is_narrow(0.0101, diameter, "")
+
+
+def test_an_unknown_verdict_is_refused():
+    problem = ball_problem(TWO, along_x(PLACES))
+    with pytest.raises(SettingError, match="verdict is 'sure'; accepted: "):
+        replace(problem, verdict="sure")
+    judged = [replace(problem, verdict=verdict).digest for verdict in ("", *VERDICTS)]
+    assert judged[0] == problem.digest
+    assert len(set(judged)) == 5
 
 
 def test_rules_that_are_switched_off_end_no_session():

@@ -27,10 +27,10 @@ from chsel.problem.trust import (
     MOST_SYSTEMATIC,
     MOST_WIDTH,
     _solved,
-    can_be_moved,
     check_trust,
     correlation,
     has_pose,
+    motion_cost,
     pose_energies,
     trust_in,
     turned,
@@ -188,7 +188,7 @@ def test_samples_of_a_continuum_are_no_modes(shifts):
 @pytest.fixture
 def held(monkeypatch):
     """No pose can be moved, so that the verdict depends on the poses of the set."""
-    monkeypatch.setattr("chsel.problem.trust.can_be_moved", lambda *_: False)
+    monkeypatch.setattr("chsel.problem.trust.motion_cost", lambda *_: math.inf)
 
 
 def lying(z=0.0):
@@ -226,10 +226,50 @@ def test_a_set_is_wide_where_any_mode_can_be_moved(monkeypatch, movable):
     found = hypotheses(POSE, lying())
     one = found.object_from_world[movable]
     monkeypatch.setattr(
-        "chsel.problem.trust.can_be_moved",
-        lambda _, pose, *__: np.array_equal(pose.matrices[0], one),
+        "chsel.problem.trust.motion_cost",
+        lambda _, pose, *__: LIMIT if np.array_equal(pose.matrices[0], one) else math.inf,
     )
     assert judged(found, sdf=GRID, known=apply(POSE, SIDE)).verdict == "wide"
+
+
+@pytest.mark.parametrize(
+    ("cost", "verdict", "said"),
+    [(8.7, "wide", "8.7 nats"), (9.4, "determined", "9.4 nats"), (13.6, "determined", None)],
+)
+def test_a_verdict_says_how_near_to_its_limit_it_is(monkeypatch, cost, verdict, said):
+    monkeypatch.setattr("chsel.problem.trust.motion_cost", lambda *_: cost)
+    trust = judged(hypotheses(POSE, moved(z=0.002)), sdf=GRID, known=on_box())
+    limit = MOST_WIDTH * GRID.diameter
+    assert (trust.verdict, trust.limit) == (verdict, limit)
+    assert f" of {1000.0 * limit:.1f} mm" in str(trust)
+    assert ("nats, wide up to 9" in str(trust)) is (said is not None)
+    assert said is None or said in str(trust)
+
+
+def test_the_text_has_no_number_that_few_contacts_cannot_show():
+    """Before any distance is known, noise and outliers are those of a prior."""
+    points, off = at_height(0.0), CENTRE + 0.5 * RADIUS * NORMALS[:1]
+    texts = [
+        str(judged(TURNED_BALL, NOISE, known=known))
+        for known in (points[:6], points[:8], np.concatenate([points[:8], off]))
+    ]
+    assert ["noise 1.0 mm" in text for text in texts] == [False, True, True]
+    assert ["outlier" in text for text in texts] == [False, False, True]
+    assert ", 1 outlier, " in texts[2]
+
+
+def test_the_text_ends_with_how_far_the_pose_may_be_off():
+    known = on_box()
+    trust = judged(hypotheses(POSE), sdf=GRID, known=known)
+    assert trust.centre_within is None
+    bound = {"centre_within": 0.00281, "turn_within": math.radians(3.2)}
+    text = str(replace(trust, **bound))
+    assert text.endswith("), centre within 2.9 mm, 4°")  # rounded up
+    wide = str(replace(trust, verdict="wide", **bound))
+    assert wide.endswith("), centre off by up to 2.9 mm and 4° or more")
+    assert str(replace(trust, verdict="nothing fits", **bound)).endswith(")")
+    assert replace(trust, **bound).numbers["turn_within"] == bound["turn_within"]
+    assert "turn_within" not in trust.numbers
 
 
 @pytest.mark.usefixtures("held")
@@ -350,7 +390,7 @@ def movable(mesh, noise=NOISE, **points):
     """Whether the mesh at POSE can be moved by 6 mm; points in the object's frame."""
     sdf = chsel.SdfGrid.from_mesh(mesh, 0.004)
     known = {name: apply(POSE, group) for name, group in points.items()}
-    return can_be_moved(problem(sdf, **known), BEST, noise, 0.006)
+    return motion_cost(problem(sdf, **known), BEST, noise, 0.006) <= LIMIT
 
 
 def on(mesh, count):

@@ -29,6 +29,7 @@ from replay.colors import CostScale
 from replay.rerun import viewer as rerun_viewer
 from replay.rerun.rerun_recorder import RerunRecorder
 from replay.rerun.scene import LEVELS, cost_levels
+from replay.rerun.text import verdict_markdown
 from tests.tools.rrd_rows import at_probe, read, shown_at
 
 WORKSPACE = Workspace((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
@@ -311,3 +312,14 @@ def test_the_scale_of_costs_is_logarithmic_from_the_lowest_to_the_highest():
     assert cost_levels(np.array([1.0, 16.0, 256.0])).tolist() == [0, LEVELS // 2, LEVELS - 1]
     assert cost_levels(np.array([2.0, 2.0])).tolist() == [0, 0]
     assert cost_levels(np.zeros(0)).tolist() == []
+
+
+def test_the_verdict_has_its_limit_and_bound_where_they_are_recorded():
+    values = {"estimated_noise": 5e-4, "outlier_share": 0.08 / 13.0, "misfit": 0.3, "modes": 1.0}
+    values |= {"set_spread": 0.0014, "verdict": 0.0}
+    numbers = "noise 0.5 mm, misfit 0.3 noise levels"
+    earlier = f"# determined\n\n1 mode, spread 1.4 mm, {numbers}\n"
+    assert verdict_markdown(values, known=9) == earlier
+    values |= {"spread_limit": 0.0049, "centre_within": 0.00281, "turn_within": 0.06}
+    now = f"# determined\n\n1 mode, spread 1.4 of 4.9 mm, {numbers}, centre within 2.9 mm, 4°\n"
+    assert verdict_markdown(values, known=9) == now
