@@ -118,7 +118,9 @@ def trust_in(
     if error > limit or noise.outliers > MOST_OUTLIERS or noise.sigma > worst:
         count, verdict = 0, NOTHING
     elif (
-        redundancy + len(points.free) + len(points.occupied) == 0
+        not sdf.has_inside
+        or LEAST_LEVELS * sdf.surface_error > width
+        or redundancy + len(points.free) + len(points.occupied) == 0
         or count > MOST_MODES
         or max(surface_spread(apart[np.ix_(part, part)]) for part in parts) > width
         or any(can_be_moved(problem, poses[part[:1]], sensor_noise, width) for part in parts)

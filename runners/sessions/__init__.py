@@ -8,7 +8,7 @@ from typing import Any
 from chsel.errors import require_choice
 from chsel.problem.settings import build_settings
 from runners.objects.loader import ObjectModel
-from runners.sessions.configurations import find_configuration
+from runners.sessions.configurations import FITTED, find_configuration
 from runners.sessions.points import PointsSession, PointsSettings
 from runners.sessions.probing import open_probing
 from runners.sessions.probing_settings import ProbingSettings
@@ -43,5 +43,6 @@ def open_session(kind: str, settings: Any, object_model: ObjectModel, seed: int)
     if kind == "sensors":
         return open_sensors(settings, object_model, seed)
     configuration = settings.configuration or object_model.configuration
-    find_configuration(configuration, object_model.name)
+    if configuration != FITTED:
+        find_configuration(configuration, object_model.name)
     return open_probing(kind, object_model.mesh, configuration, settings, seed)
