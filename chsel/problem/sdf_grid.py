@@ -314,7 +314,7 @@ def _warn_of_thin_walls(mesh: trimesh.Trimesh, resolution: float) -> None:
         f"has less than {_NODES_ACROSS} nodes: they are {1e3 * resolution:.3g} mm apart, and poses "
         "may be wrong; choose a finer one by resolution"
     )
-    warnings.warn(MeshWarning("thin_walls", text), stacklevel=4)
+    warnings.warn(MeshWarning("thin_walls", text), stacklevel=3)
 
 
 def wall_thicknesses(mesh: trimesh.Trimesh, below: float) -> FloatArray:

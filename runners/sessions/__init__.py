@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
-from chsel.errors import require_choice
+from chsel.errors import MeshWarning, require_choice
 from chsel.problem.settings import build_settings
 from runners.objects.loader import ObjectModel
 from runners.sessions.configurations import FITTED, find_configuration
@@ -45,4 +46,10 @@ def open_session(kind: str, settings: Any, object_model: ObjectModel, seed: int)
     configuration = settings.configuration or object_model.configuration
     if configuration != FITTED:
         find_configuration(configuration, object_model.name)
+        if not object_model.of_paper:
+            text = (
+                f"configuration {configuration} is laid out for an object of the paper's size, and "
+                "its probes may miss this one; configuration=fitted is for any size"
+            )
+            warnings.warn(MeshWarning("other_size", text), stacklevel=2)
     return open_probing(kind, object_model.mesh, configuration, settings, seed)

@@ -13,7 +13,6 @@ from runners import fetch
 from runners.command.choices import CONF
 from runners.command.program import plain
 from runners.objects.loader import ObjectConfig, ObjectModel, check_size, load_object
-from runners.sensors.rig import Rig
 from runners.sessions import session_settings
 from tests.runners.in_process import run
 
@@ -75,7 +74,10 @@ def test_objects_of_the_trials_have_their_grid_and_all_others_that_of_object_gri
 ):
     trimesh.creation.box((0.03, 0.05, 0.04)).export(tmp_path / "thing.stl")
     monkeypatch.chdir(tmp_path)
-    needed = {"points": {"path": "x.npz"}, "sensors": {"path": "x", "rig": Rig("r", "world")}}
+    needed = {
+        "points": {"path": "x.npz"},
+        "sensors": {"path": "x", "rig": {"name": "r", "world": "world"}},
+    }
     settings = session_settings(kind, needed.get(kind, {}))
     model = load_object(chosen(*overrides.split()), tmp_path)
     assert model.resolution(settings) == spacing
