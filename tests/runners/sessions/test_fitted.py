@@ -40,8 +40,10 @@ def probed(kind, mesh, settings=None):
     return session, probes
 
 
-@pytest.mark.parametrize("kind", ["kinematic", "simulated"])
-@pytest.mark.parametrize("name", MESHES)
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [*(("kinematic", name) for name in MESHES), ("simulated", "30 mm"), ("simulated", "plate")],
+)
 def test_most_probes_touch_an_object_all_over(kind, name):
     if kind == "simulated":
         pytest.importorskip("pybullet")
@@ -89,7 +91,7 @@ def test_the_hand_is_the_one_that_is_meant():
     assert bounds[:, 0, 2].min() == pytest.approx(LOWEST)
 
 
-@pytest.mark.parametrize("size", ["30 mm", "80 mm", "1 m"])
+@pytest.mark.parametrize("size", ["30 mm", "80 mm"])
 def test_a_mesh_of_ones_own_is_found_by_the_kinematic_hand(size, tmp_path):
     """By default; what is determined is right, within 3 % of the diameter."""
     mesh = MESHES[size]
