@@ -31,8 +31,10 @@ _kept: dict[tuple[str, float | None, float], SdfGrid] = {}  # those made last, i
 Derived = TypeVar("Derived")
 _NODES_PER_EXTENT = 20  # of the default grid, over the object's smallest extent
 _DEFAULT_SPACING = 0.01  # of its nodes, at most, metres
-_NODES_ACROSS = 2  # of the default grid, in the thickness of a thin object
+_NODES_ACROSS = 3  # in a wall that the grid resolves
 _LEAST_PADDING = 1.5  # spacings: nodes are half a spacing beside a flat side, not on it
+_WALL_RAYS = 2000  # that measure walls, from points all over the surface
+_WALL_SHARE = 0.05  # of the surface on thin walls that is worth a warning
 _PART_NODES = 250_000  # least number of nodes that are sampled at once
 _PART_FACES = 5  # faces per node of a part: preparing 1.3 million costs as much as 65 000 nodes
 _WHOLE = 1e-6  # relative; from whole winding numbers the distance has its rounding by libigl
@@ -128,8 +130,8 @@ class SdfGrid(ShapesShown):
 
         Values are rounded to 32 bits (nanometres), which halves the size in recordings.
         resolution: metres; None: a twentieth of the smallest extent, at most 1 cm, or what keeps
-        the grid at 2 million nodes. The padding of a thin object then shrinks, so that two nodes
-        are across it. A MeshWarning says what was chosen.
+        the grid at 2 million nodes. The padding of a thin object then shrinks, so that three nodes
+        are across it. A MeshWarning says what was chosen, and another which walls are thinner.
         progress: called before each part of a large grid with the number of nodes done and of all
         nodes; it changes no bit.
         """
@@ -149,6 +151,7 @@ class SdfGrid(ShapesShown):
                 f"an SDF of resolution {resolution:g} m needs {math.prod(shape):.3g} nodes; "
                 f"accepted: at most {MAX_NODES:.0e}, so a coarser resolution"
             )
+        _warn_of_thin_walls(mesh, resolution)
         origin = np.asarray(mesh.bounds, dtype=np.float64)[0] - padding
         values, gradients = np.empty(math.prod(shape)), np.empty((math.prod(shape), 3))
         overlaps = 0
@@ -186,6 +189,27 @@ class SdfGrid(ShapesShown):
         """Diagonal in metres of the box around the object."""
         inside = np.argwhere(self.values < self.resolution) * self.resolution
         return float(np.sqrt((np.ptp(inside, axis=0) ** 2).sum())) if len(inside) else 0.0
+
+    @property
+    def has_inside(self) -> bool:
+        """Whether a node is as deep in the object as nodes are apart, as one of three in a wall is.
+
+        Depths in thinner walls are as wrong as they are large, and free points say next to nothing.
+        """
+        return bool(-self.values.min() >= (1.0 - 1e-6) * self.resolution)
+
+    @cached_property
+    def surface_error(self) -> float:
+        """Root mean square of interpolated distances at points of the surface, metres.
+
+        The points are those nearest to the nodes beside the surface, exact as the values are.
+        """
+        beside = 0.5 * math.sqrt(3.0) * self.resolution  # a surface point has a node so near
+        nodes = np.argwhere(np.abs(self.values) < beside)
+        i, j, k = nodes.T
+        away = self.values[i, j, k][:, None] * self.gradients[i, j, k]
+        distances = self.at(self.origin + nodes * self.resolution - away, lookup="trilinear")[0]
+        return math.sqrt(float(np.cumsum(distances**2)[-1]) / len(nodes)) if len(nodes) else 0.0
 
     @cached_property
     def digest(self) -> str:
@@ -302,6 +326,45 @@ def _default_spacing(mesh: trimesh.Trimesh, padding: float) -> tuple[float, floa
         )
         warnings.warn(MeshWarning("coarse_grid", text), stacklevel=3)
     return spacing, padding
+
+
+def _warn_of_thin_walls(mesh: trimesh.Trimesh, resolution: float) -> None:
+    """Warn if much of a mesh's surface is on walls in which a grid has less than three nodes."""
+    walls = wall_thicknesses(mesh, _NODES_ACROSS * resolution)
+    thin = np.isfinite(walls)
+    if thin.mean() < _WALL_SHARE:
+        return
+    share, typical = f"{thin.mean():.0%}", f"{1e3 * np.median(walls[thin]):.3g} mm"
+    text = (
+        f"{share} of the object's surface is on walls of {typical} (median), in which the SDF grid "
+        f"has less than {_NODES_ACROSS} nodes: they are {1e3 * resolution:.3g} mm apart, and poses "
+        "may be wrong; choose a finer one by resolution"
+    )
+    warnings.warn(MeshWarning("thin_walls", text), stacklevel=3)
+
+
+def wall_thicknesses(mesh: trimesh.Trimesh, below: float) -> FloatArray:
+    """Thickness in metres of the object behind points (S,) all over its surface.
+
+    It is measured straight into the object, and infinite where it is not less than `below`, or the
+    way does not end outside of the object, such as where its parts overlap.
+    """
+    import igl
+    import trimesh
+
+    points, on = trimesh.sample.sample_surface(mesh, _WALL_RAYS, seed=0)
+    inwards = -np.asarray(mesh.face_normals)[on]
+    step = 1e-5 * float(np.linalg.norm(mesh.extents))  # to either side of a face
+    vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
+    faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
+    tree = igl.AABB()
+    tree.init(vertices, faces)
+    hit, way, _ = tree.intersect_ray_first(vertices, faces, points + step * inwards, inwards)
+    thicknesses = np.where(hit >= 0, way + step, np.inf)
+    thin = np.flatnonzero(thicknesses < below - step)
+    beyond = points[thin] + (thicknesses[thin] + step)[:, None] * inwards[thin]
+    thicknesses[thin[mesh_sdf(mesh, beyond)[0] <= 0.0]] = np.inf
+    return np.where(thicknesses < below - step, thicknesses, np.inf)
 
 
 def _shape(mesh: trimesh.Trimesh, resolution: float, padding: float) -> tuple[int, ...]:

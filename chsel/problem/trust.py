@@ -108,6 +108,8 @@ def trust_in(
     worst = max(MOST_NOISE, LEAST_LEVELS * sensor_noise)
     if error > limit or noise.outliers > MOST_OUTLIERS or noise.sigma > worst:
         count, verdict = 0, NOTHING
+    elif not sdf.has_inside or LEAST_LEVELS * sdf.surface_error > width:
+        count, verdict, why = 0, WIDE, "the SDF grid is too coarse for the object"
     elif redundancy + len(points.free) + len(points.occupied) == 0:
         count, verdict, why = 0, WIDE, "no more contacts than a pose can fit"
     elif count > MOST_MODES:

@@ -24,6 +24,7 @@ from runners.run.grasps import GraspConfig
 from runners.run.recording import RecordingConfig
 from runners.sensors.rig import Rig
 from runners.sessions import SESSIONS
+from runners.sessions.configurations import FITTED
 from runners.sessions.faults import CLEAN, LEVELS
 from runners.sessions.probing_settings import ProbingSettings
 
@@ -52,7 +53,7 @@ def store_choices() -> None:
         group, _, name = f"object/{choice}".rpartition("/")
         store(group, name, settings_mapping(config), package="object")
     mesh = {"name": "mesh", "kind": "file", "scale": 1.0, "epsilon": 0.001, "scan": None}
-    store("object", "mesh", {**mesh, "configuration": "drill", "path": None})
+    store("object", "mesh", {**mesh, "configuration": FITTED, "path": None})
     for name, written in (
         ("both", RecordingConfig()),
         ("mcap", RecordingConfig(rerun=False)),

@@ -66,6 +66,7 @@ OBJECTS = {name: ObjectConfig(name, *trial) for name, trial in _TRIALS.items()} 
     for scan, name in SCANS.items()
 }
 """The choices of `object=` but for mesh files."""
+PAPER_RESOLUTION = 0.010  # m: of the SDF grids of these in the paper's simulated trials
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,11 +78,21 @@ class ObjectModel:
     scale: float
     epsilon: float
     configuration: str
+    of_paper: bool = False  # one of the paper's simulated trials, at its scale there
     _grids: dict[tuple[float | None, float], SdfGrid] = field(default_factory=dict, repr=False)
+
+    def resolution(self, settings: Any) -> float | None:
+        """Spacing in metres of the SDF grid that a session's settings ask for.
+
+        Where they leave it open, an object of the paper's trials has that of the paper, and every
+        other that of `object_grid`, which None stands for.
+        """
+        chosen: float | None = settings.object_resolution
+        return PAPER_RESOLUTION if chosen is None and self.of_paper else chosen
 
     def grid(self, settings: Any) -> SdfGrid:
         """The signed distance grid that a session's settings ask for, made once."""
-        resolution, padding = settings.object_resolution, settings.object_padding
+        resolution, padding = self.resolution(settings), settings.object_padding
         if (resolution, padding) not in self._grids:
             grid = object_grid(self.mesh, resolution, padding=padding)
             self._grids[resolution, padding] = grid
@@ -104,7 +115,15 @@ def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:
         mesh = load_mesh(scan_file(assets, config.scan or ""), scale=config.scale)
     else:
         mesh = load_model(config.name, config.scale)
-    return ObjectModel(config.name, mesh, config.scale, config.epsilon, config.configuration)
+    return ObjectModel(
+        config.name, mesh, config.scale, config.epsilon, config.configuration, _of_paper(config)
+    )
+
+
+def _of_paper(config: ObjectConfig) -> bool:
+    """Whether an object is one of the paper's simulated trials, at its scale there."""
+    shipped = config.kind == "model" or SCANS.get(config.scan or "") == config.name
+    return shipped and config.kind != "file" and config.scale == _TRIALS[config.name][0]
 
 
 def check_size(model: ObjectModel, workspace: Workspace) -> list[MeshWarning]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from chsel.problem.online_registration import OnlineRegistration, OnlineSettings
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from replay.environment import environment
-from runners.objects.loader import ObjectConfig, ObjectModel, check_size, load_object
+from runners.objects.loader import ObjectConfig, check_size, load_object
 from runners.objects.scans import AssetsConfig
 from runners.run.grasps import GraspConfig
 from runners.run.recording import RecordingConfig
@@ -77,6 +78,8 @@ class Scene:
     mesh: trimesh.Trimesh
     sdf: SdfGrid
     start: Start
+    # Spacing of the SDF grid that the settings ask for, metres; None: that of `object_grid`.
+    object_resolution: float | None = None
     warnings: tuple[InputWarning, ...] = ()  # about the object and a file of points
     steering: Steering | None = None  # chooses the probes; None for the session's own order
 
@@ -112,20 +115,23 @@ def open_scene(config: ProbeConfig) -> Scene:
     policy = build_policy(policy_name, values)
     found: list[InputWarning] = []
     session: ProbeSource
+    resolution: float | None = None
     if kind == "recorded":
         session = RecordedSession(settings)
         of, start = session.recorded, session.start
         name, mesh, sdf = of.object, of.mesh, of.sdf
     else:
-        model, found = _load_object(config)
-        session = open_session(kind, settings, model, config.seed)
-        name, mesh, sdf = model.name, model.mesh, model.grid(settings)
+        with _caught() as found:
+            model = load_object(config.object, config.assets.folder)
+            session = open_session(kind, settings, model, config.seed)
+            sdf = model.grid(settings)
+        name, mesh, resolution = model.name, model.mesh, model.resolution(settings)
         start = Start(settings.start_contacts, settings.start_probe)
         found += getattr(session, "warnings", [])
         if kind in _OF_REAL_OBJECTS:
             found += check_size(model, session.workspace)
     if policy_name == GRID:
-        return Scene(session, name, mesh, sdf, start, tuple(found))
+        return Scene(session, name, mesh, sdf, start, resolution, tuple(found))
     if not isinstance(session, Steerable):
         raise SessionError(
             f"session {kind} cannot be steered, as its probes are given; accepted: policy=grid, or "
@@ -134,21 +140,21 @@ def open_scene(config: ProbeConfig) -> Scene:
     actions = session.offer(policy.settings.actions)
     place = sdf, session.workspace, session.free_resolution
     steering = Steering(policy, *place, actions, session.hand, seed=config.seed)
-    return Scene(session, name, mesh, sdf, FIRST_CONTACT, tuple(found), steering)
+    return Scene(session, name, mesh, sdf, FIRST_CONTACT, resolution, tuple(found), steering)
 
 
-def _load_object(config: ProbeConfig) -> tuple[ObjectModel, list[InputWarning]]:
-    """The object, and warnings about its mesh, which belong into the recording."""
+@contextmanager
+def _caught() -> Iterator[list[InputWarning]]:
+    """Warnings about the object's mesh and grid, which belong into the recording."""
+    found: list[InputWarning] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        object_model = load_object(config.object, config.assets.folder)
-    found = []
+        yield found
     for each in caught:
         if isinstance(each.message, InputWarning):
             found.append(each.message)
         else:
             warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
-    return object_model, found
 
 
 def session_started(
@@ -157,7 +163,15 @@ def session_started(
     """The first event of the recording."""
     session = scene.session
     recorded = {key: value for key, value in values.items() if key not in _NOT_OF_THE_RESULT}
-    recorded["session"] = without_defaults(values["session"])
+    used = {
+        "free_resolution": session.free_resolution,
+        "object_resolution": scene.object_resolution,
+    }
+    # Numbers that settings leave to the object, so that a recording has them.
+    recorded["session"] = {
+        key: used.get(key) if value is None else value
+        for key, value in without_defaults(values["session"]).items()
+    }
     if scene.steering is None:
         recorded.pop("policy", None)
     if config.grasp.path is None:

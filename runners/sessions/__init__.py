@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
-from chsel.errors import require_choice
+from chsel.errors import MeshWarning, require_choice
 from chsel.problem.settings import build_settings
 from runners.objects.loader import ObjectModel
-from runners.sessions.configurations import find_configuration
+from runners.sessions.configurations import FITTED, find_configuration
 from runners.sessions.points import PointsSession, PointsSettings
 from runners.sessions.probing import open_probing
 from runners.sessions.probing_settings import ProbingSettings
@@ -43,5 +44,12 @@ def open_session(kind: str, settings: Any, object_model: ObjectModel, seed: int)
     if kind == "sensors":
         return open_sensors(settings, object_model, seed)
     configuration = settings.configuration or object_model.configuration
-    find_configuration(configuration, object_model.name)
+    if configuration != FITTED:
+        find_configuration(configuration, object_model.name)
+        if not object_model.of_paper:
+            text = (
+                f"configuration {configuration} is laid out for an object of the paper's size, and "
+                "its probes may miss this one; configuration=fitted is for any size"
+            )
+            warnings.warn(MeshWarning("other_size", text), stacklevel=2)
     return open_probing(kind, object_model.mesh, configuration, settings, seed)

@@ -1,4 +1,4 @@
-"""The 17 configurations: how an object lies before the gripper, and where it is probed."""
+"""How an object lies before the gripper, and where it is probed: the paper's 17 configurations."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from chsel.errors import require_choice
 from chsel.problem.points import Workspace
 
 Triple = tuple[float, float, float]
+
+FITTED = "fitted"
+"""The configuration that is made for an object of any size, see `fitted_configuration`."""
 
 WORKSPACE = Workspace((-0.1, -0.3, -0.075), (0.5, 0.3, 0.625))
 HAMMER_WORKSPACE = Workspace((-0.1, -0.3, -0.075), (0.5, 0.5, 0.4))
@@ -29,6 +32,8 @@ class Configuration:
     position: Triple = (0.25, 0.0, 0.2)  # of the centre of mass in the world, metres
     rotation: Triple = (0.0, 0.0, 0.0)  # radians about the world's axes x, y, z, in this order
     workspace: Workspace = WORKSPACE  # in which the object is sought
+    stand: float = 0.0  # height of what the object lies on, metres above the floor
+    free_resolution: float = 0.025  # side of a free voxel where settings name none, metres
 
     @property
     def grid(self) -> list[tuple[float, float]]:
@@ -90,11 +95,11 @@ CONFIGURATIONS = {
 
 
 def find_configuration(name: str, object_name: str | None = None) -> Configuration:
-    """The configuration called `name`; with `object_name`, it must be one of that object's.
+    """The configuration of the 17 called `name`; with `object_name`, one of that object's.
 
     An object that has no configurations of its own takes any. Raises SettingError for a name that
     is not accepted.
     """
     fitting = [key for key, one in CONFIGURATIONS.items() if one.object == object_name]
-    require_choice("configuration", name, fitting or CONFIGURATIONS)
+    require_choice("configuration", name, [*(fitting or CONFIGURATIONS), FITTED])
     return CONFIGURATIONS[name]

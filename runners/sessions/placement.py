@@ -27,6 +27,13 @@ def laid_down(mesh: trimesh.Trimesh, configuration: Configuration) -> FloatArray
     return resting
 
 
+def on_stand(world_from_object: FloatArray, configuration: Configuration) -> FloatArray:
+    """The same pose (4, 4), from the floor onto what the configuration's object lies on."""
+    raised = world_from_object.copy()
+    raised[2, 3] += configuration.stand
+    return raised
+
+
 def spawn_pose(mesh: trimesh.Trimesh, configuration: Configuration) -> FloatArray:
     """The pose world_from_object (4, 4) that a configuration gives its object, floor or not."""
     own_yaw = axis_angle(np.eye(3)[2], MESH_YAW.get(configuration.object, 0.0))

@@ -48,7 +48,8 @@ class PointsSettings:
     workspace: tuple[tuple[float, float], ...] | None = None
     """[[x0, x1], [y0, y1], [z0, z1]], metres; None: around the points, padded by the diameter."""
     free_resolution: float = FREE_RESOLUTION  # voxel side of free space, metres
-    object_resolution: float | None = None  # of the SDF grid, metres; None: that of `object_grid`
+    object_resolution: float | None = None
+    """Of the SDF grid, metres; None: by the object, see `ObjectModel.resolution`."""
     object_padding: float = OBJECT_PADDING  # of the SDF grid, metres
     start_contacts: int = 0  # a registration needs so many contacts
     start_probe: int = 0  # and this index of the probe

@@ -22,10 +22,16 @@ from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.streams import Purpose, StreamKey, normals
-from runners.sessions.configurations import WORKSPACE, Configuration, find_configuration
+from runners.sessions.configurations import (
+    FITTED,
+    WORKSPACE,
+    Configuration,
+    find_configuration,
+)
 from runners.sessions.faults import Faults, FaultSettings, probed_mesh
+from runners.sessions.fitted import fitted_configuration
 from runners.sessions.gripper import X_REST, Engine, Gripper
-from runners.sessions.placement import centre_of_mass, laid_down
+from runners.sessions.placement import centre_of_mass, laid_down, on_stand
 from runners.sessions.probing_hand import (
     ROTATION,
     ProbingHand,
@@ -51,13 +57,18 @@ def open_probing(
 
     Raises SessionError for an unknown configuration, or where PyBullet is not installed.
     """
-    configuration, hand = find_configuration(configuration_name), open_hand(settings.hand)
+    hand = open_hand(settings.hand)
+    if configuration_name == FITTED:
+        configuration = fitted_configuration(mesh, hand)
+    else:
+        configuration = find_configuration(configuration_name)
     engine: Engine
     if kind == "kinematic":
         from runners.sessions.kinematic import KinematicEngine
 
         probed = probed_mesh(mesh, settings.faults)
-        engine = KinematicEngine(probed, laid_down(mesh, configuration), settings, hand)
+        laid = on_stand(laid_down(mesh, configuration), configuration)
+        engine = KinematicEngine(probed, laid, settings, hand)
     else:
         from runners.sessions.simulated import PyBulletEngine
 
@@ -83,11 +94,11 @@ class ProbingSession:
         """
         self.configuration, self.settings = configuration, settings
         self.workspace = choose_workspace(configuration, settings)
-        self.free_resolution = settings.free_resolution
+        self.free_resolution = settings.free_resolution or configuration.free_resolution
         self.world_from_object: FloatArray | None = engine.world_from_object
         self.count = len(configuration.grid)
         self.push_distance, self._seed = expected_moves(vars(settings)), seed
-        self._voxels = FreeVoxels(Lattice(self.workspace.lower, settings.free_resolution))
+        self._voxels = FreeVoxels(Lattice(self.workspace.lower, self.free_resolution))
         self.initial_points = KnownPoints(
             free=self._voxels.add(self._boundary(mesh, engine.world_from_object))
         )
@@ -200,7 +211,9 @@ class ProbingSession:
 
 def choose_workspace(configuration: Configuration, settings: ProbingSettings) -> Workspace:
     """The box in which the object is sought."""
-    return WORKSPACE if settings.workspace == "paper" else configuration.workspace
+    if settings.workspace == "paper" and configuration.name != FITTED:
+        return WORKSPACE
+    return configuration.workspace
 
 
 def floor_slab(lattice: Lattice, vertices: FloatArray) -> FloatArray:

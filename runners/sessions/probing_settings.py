@@ -28,7 +28,7 @@ _STANDING = (("moves", 0.0), ("expect_moves", None))  # an object that stands st
 class ProbingSettings(CheckedSettings):
     """How the gripper probes, and what is written down of it."""
 
-    configuration: str | None = None  # name of one of the 17; None: the object's own
+    configuration: str | None = None  # one of the 17, or FITTED; None: the object's own
     boundary: Annotated[str, one_of("floor_slab", "box_shell", "both")] = "floor_slab"
     """Voxels free from the start: two layers below the floor, the workspace's faces, or both."""
     workspace: Annotated[str, one_of("reference", "paper")] = "reference"
@@ -37,8 +37,10 @@ class ProbingSettings(CheckedSettings):
     """Where free space is swept: all the way, or only where control steps end."""
     collision_mesh: Annotated[str, one_of("visual", "vhacd")] = "visual"
     """Of PyBullet: the mesh itself, or its convex parts."""
-    free_resolution: Length = 0.025  # side of a free voxel
-    object_resolution: Length = 0.010  # of the object's SDF grid
+    # Side of a free voxel; None: 25 mm in the 17 configurations, as in the paper, 10 mm in FITTED.
+    free_resolution: Length | None = None
+    # Of the object's SDF grid; None: by the object, see `ObjectModel.resolution`.
+    object_resolution: Length | None = None
     object_padding: Length = 0.05  # of the object's SDF grid
     interior_spacing: Length = 0.005  # of the hand's interior points
     interior_depth: Length = 0.010  # of the hand's interior points

@@ -53,7 +53,8 @@ class SensorsSettings(CheckedSettings):
     pose: str | None = None
     """File of the true pose; None: that beside the log, if there is one; "none": unknown."""
     free_resolution: Annotated[float, positive] = 0.01  # side of a free voxel, m
-    object_resolution: Annotated[float, positive] = 0.005  # of the object's SDF grid, m
+    object_resolution: Annotated[float, positive] | None = None
+    """Of the object's SDF grid, m; None: by the object, see `ObjectModel.resolution`."""
     object_padding: Annotated[float, positive] = 0.05  # of the object's SDF grid, m
     start_contacts: Annotated[int, not_negative] = 4  # a registration needs so many contacts
     start_probe: Annotated[int, not_negative] = 0  # and this index of the probe

@@ -17,7 +17,7 @@ from runners.sessions.configurations import Configuration
 from runners.sessions.faults import probed_mesh
 from runners.sessions.gripper import START, Touch
 from runners.sessions.physics_engine import connect, silent
-from runners.sessions.placement import centre_of_mass, laid_down, lowest
+from runners.sessions.placement import centre_of_mass, laid_down, lowest, on_stand
 from runners.sessions.probing_hand import ProbingHand, turned_from_forward
 from runners.sessions.probing_settings import ProbingSettings
 
@@ -61,7 +61,8 @@ class PyBulletEngine:
         try:
             _set_up(self._world)
             with tempfile.TemporaryDirectory() as folder:
-                self.world_from_object = _settle(self._world, mesh, laid_down(mesh, configuration))
+                settled = _settle(self._world, mesh, laid_down(mesh, configuration))
+                self.world_from_object = on_stand(settled, configuration)
                 probed = probed_mesh(mesh, settings.faults)
                 file = _collision_file(self._world, probed, Path(folder), settings.collision_mesh)
                 concave = settings.collision_mesh == "visual"

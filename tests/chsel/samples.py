@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import trimesh
 
 from chsel.problem.noise import EXTENT, INDEPENDENT, LATER, SHARE
 from chsel.problem.online_registration import OnlineRegistration
@@ -29,6 +30,12 @@ def ball_grid(radius, resolution, half):
     safe = np.where(distance > 0.0, distance, 1.0)[..., None]
     gradient = np.where(distance[..., None] > 0.0, nodes / safe, [1.0, 0.0, 0.0])
     return SdfGrid(np.full(3, -half * resolution), resolution, distance - radius, gradient)
+
+
+def bracket():
+    """An L of 80 x 60 x 40 mm with walls of 6 mm, a corner at the origin."""
+    parts = [trimesh.creation.box(bounds=[[0, 0, 0], top]) for top in ([80, 6, 40], [6, 60, 40])]
+    return trimesh.boolean.union(parts).apply_scale(0.001)
 
 
 def box_distance(points, sides):

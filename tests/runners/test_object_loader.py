@@ -1,5 +1,7 @@
 """The choice of an object leads to its mesh, or to a clear error."""
 
+from dataclasses import replace
+
 import pytest
 import trimesh
 from hydra import compose, initialize_config_dir
@@ -11,6 +13,7 @@ from runners import fetch
 from runners.command.choices import CONF
 from runners.command.program import plain
 from runners.objects.loader import ObjectConfig, ObjectModel, check_size, load_object
+from runners.sessions import session_settings
 from tests.runners.in_process import run
 
 # name: (simulated scale, epsilon in metres, default configuration), as the paper's trials have it
@@ -53,6 +56,45 @@ def test_a_mesh_file_is_found_from_the_working_directory(tmp_path, monkeypatch):
     loaded = load_object(config, tmp_path)
     assert loaded.mesh.extents == pytest.approx([0.1, 0.2, 0.3])
     assert (loaded.scale, loaded.epsilon) == (0.001, 0.001)
+
+
+@pytest.mark.parametrize("kind", ["simulated", "kinematic", "points", "sensors"])
+@pytest.mark.parametrize(
+    ("overrides", "spacing"),
+    [
+        ("object=drill", 0.010),
+        ("object=clamp", 0.010),
+        ("object=drill object.scale=1", None),
+        ("object=mesh object.path=thing.stl", None),
+        ("object=mesh object.path=thing.stl object.name=drill object.scale=2.5", None),
+    ],
+)
+def test_objects_of_the_trials_have_their_grid_and_all_others_that_of_object_grid(
+    kind, overrides, spacing, tmp_path, monkeypatch
+):
+    trimesh.creation.box((0.03, 0.05, 0.04)).export(tmp_path / "thing.stl")
+    monkeypatch.chdir(tmp_path)
+    needed = {
+        "points": {"path": "x.npz"},
+        "sensors": {"path": "x", "rig": {"name": "r", "world": "world"}},
+    }
+    settings = session_settings(kind, needed.get(kind, {}))
+    model = load_object(chosen(*overrides.split()), tmp_path)
+    assert model.resolution(settings) == spacing
+    assert model.resolution(replace(settings, object_resolution=0.004)) == 0.004
+    if overrides.endswith("stl"):
+        assert model.grid(settings).resolution == pytest.approx(0.03 / 20.0)
+
+
+def test_scans_of_the_trials_have_their_grid_and_other_scans_do_not(ycb_directory):
+    settings = session_settings("kinematic", {})
+    for overrides, spacing in (
+        ("object=ycb/clamp", 0.010),
+        ("object=ycb/clamp object.scale=1", None),
+        ("object=ycb/clamp object.scan=006_mustard_bottle", None),
+    ):
+        model = load_object(chosen(*overrides.split()), ycb_directory)
+        assert model.resolution(settings) == spacing, overrides
 
 
 @pytest.mark.parametrize(

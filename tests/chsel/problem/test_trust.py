@@ -35,7 +35,7 @@ from chsel.problem.trust import (
     trust_in,
     turned,
 )
-from tests.chsel.samples import hypotheses_at, plain_energies, plain_energy
+from tests.chsel.samples import bracket, hypotheses_at, plain_energies, plain_energy
 
 SIDES = np.array([0.1, 0.06, 0.16])
 BOX = trimesh.creation.box(SIDES)
@@ -506,3 +506,23 @@ def test_levels_of_noise_are_those_of_the_sensor_and_of_all_else(sensor):
     weights = np.exp(-0.5 * (np.log(errors / 0.002) / 0.6) ** 2)
     np.testing.assert_allclose(noise.sigmas, np.sqrt(sensor**2 + errors**2))
     np.testing.assert_allclose(noise.weights, weights / weights.sum())
+
+
+@pytest.mark.parametrize(
+    ("mesh", "coarse", "fine"),
+    [
+        (bracket(), 0.005, 0.002),  # less than three nodes in a wall, and three
+        (trimesh.creation.box((0.03, 0.02, 0.04)), 0.0083, 0.002),  # rounded by millimetres
+    ],
+)
+def test_a_grid_that_is_too_coarse_for_the_object_determines_nothing(mesh, coarse, fine):
+    """At the true pose, with exact points all around."""
+    known = apply(POSE, trimesh.sample.sample_surface(mesh, 60, seed=0)[0])
+    lower, upper = mesh.bounds
+    free = np.random.default_rng(0).uniform(lower - 0.03, upper + 0.03, (4000, 3))
+    free = apply(POSE, free[chsel.problem.sdf_grid.mesh_sdf(mesh, free)[0] > 0.0])
+    found = hypotheses_at(inverse(POSE[None]))
+    for resolution, verdict in ((coarse, "wide"), (fine, "determined")):
+        sdf = chsel.SdfGrid.from_mesh(mesh, resolution)
+        trust = judged(found, NOISE, sdf=sdf, known=known, free=free)
+        assert trust.verdict == verdict, resolution

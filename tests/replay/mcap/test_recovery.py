@@ -178,9 +178,12 @@ def test_verify_does_not_judge_by_what_is_lost(tmp_path):
     assert outcomes == [NO_RESULT, EQUAL][: len(found.problems)]
 
 
-def test_a_damaged_grid_is_made_again_from_the_mesh(tmp_path, events, assert_same, capsys):
-    config = {"session": {"object_resolution": 0.02, "object_padding": 0.03}}
-    grid = object_grid(events[0].mesh, 0.02, padding=0.03)
+@pytest.mark.parametrize("resolution", [0.02, None])
+def test_a_damaged_grid_is_made_again_from_the_mesh(
+    tmp_path, events, assert_same, capsys, resolution
+):
+    config = {"session": {"object_resolution": resolution, "object_padding": 0.03}}
+    grid = object_grid(events[0].mesh, resolution, padding=0.03)
     start = dataclasses.replace(events[0], sdf=grid, config=config)
     path, out = tmp_path / "damaged.mcap", tmp_path / "out.mcap"
     data = recorded(tmp_path / "whole.mcap", [start])
