@@ -94,9 +94,9 @@ class PinholeCamera:
         off_centre = away > _OFF_CENTRE * max(self.width, self.height)
         if inside and not (off_centre and 2.0 * swapped < away):
             return []
-        what = "" if inside else ", outside of the image"
+        where = "for" if inside else "outside of"
         text = (
-            f"camera has cx, cy = {self.cx:g}, {self.cy:g}{what}, for {self.width} x "
+            f"cx, cy are {self.cx:g}, {self.cy:g}, {where} an image of {self.width} x "
             f"{self.height} pixels (width x height); check that they are of this image, not swapped"
         )
         return [InputWarning("principal_point", text)]

@@ -25,23 +25,8 @@ from runners.sensors.session_report import Counts
 
 INTEGER_UNIT = 0.001  # m: of 16-bit depth images, as all the world has it
 FINE, COARSE = 0.0001, 0.001  # m: units of recorded images
-_OFF_CENTRE = 0.08  # of a side of the image, by which principal points are off its middle at most
 _MANY_PIXELS = 50_000  # of an image: more are looked at in part
 _EARLY = 0.95  # of the interval between two images: stamps are not exact
-
-
-def exchanged_centre(camera: PinholeCamera) -> str:
-    """What is suspicious about the principal point of a camera; "" if nothing is."""
-    middle = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-    size = np.array([camera.width, camera.height])
-    away = (np.abs(np.array([camera.cx, camera.cy]) - middle) / size).max()
-    exchanged = (np.abs(np.array([camera.cy, camera.cx]) - middle) / size).max()
-    if away > _OFF_CENTRE and exchanged < 0.5 * away:
-        return (
-            f"cx {camera.cx:g} and cy {camera.cy:g} look exchanged, as its images have "
-            f"{camera.width} x {camera.height} pixels; check its intrinsics"
-        )
-    return ""
 
 
 MISSED = (

@@ -11,7 +11,7 @@ import numpy as np
 from chsel.errors import SessionError, SettingError
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.sensing.depth_camera import PinholeCamera, valid_pixels
-from runners.sensors.depth_camera import exchanged_centre, metres
+from runners.sensors.depth_camera import metres
 from runners.sensors.log.clocks import Clocks
 from runners.sensors.log.messages import (
     CameraInfoMessage,
@@ -205,8 +205,8 @@ class FirstPass:
                 "not say that its images are rectified: K is used; with rectified: true in the "
                 "rig, P is"
             )
-        if exchanged := exchanged_centre(camera):
-            self._warnings.warn(f"{sensor.name}: {exchanged}")
+        for warning in camera.check_centre():
+            self._warnings.warn(f"{sensor.name}: {warning.text}")
         if not (isinstance(sensor, BubbleRig) and sensor.kind == "deformation"):
             _check_unit(sensor, images)
         return camera

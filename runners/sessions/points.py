@@ -42,7 +42,11 @@ from runners.objects.loader import ObjectModel
 
 @dataclass(frozen=True)
 class PointsSettings:
-    """A file of known points. With the defaults, `chsel.register` has the same bits."""
+    """A file of known points.
+
+    With the defaults, `chsel.register` has the same bits, but for objects of the paper's trials at
+    their size there, see `ObjectModel.resolution`.
+    """
 
     path: str | None = None  # .npz, .csv, .ply, .off, .xyz or .stl
     workspace: tuple[tuple[float, float], ...] | None = None

@@ -20,7 +20,6 @@ from runners.sensors.cell import FreeMap, RobotCell, is_entered
 from runners.sensors.depth_camera import (
     MISSED,
     View,
-    exchanged_centre,
     recorded_image,
     some_rays,
 )
@@ -218,8 +217,8 @@ class DepthFrameSession:
     def _remarks(self, name: str) -> Iterator[tuple[str, str]]:
         """Levels and texts on what was left out, and on what is suspicious."""
         found, label = self._points, self._points.labelled
-        if exchanged := exchanged_centre(self._frame.camera):
-            yield "warning", f"{name}: {exchanged}"
+        for warning in self._frame.camera.check_centre():
+            yield "warning", f"{name}: {warning.text}"
         frame = self._frame
         poses = {"world_from_camera": frame.world_from_camera}
         if self.world_from_object is not None:

@@ -144,7 +144,7 @@ def test_numbers_of_yaml_are_those_of_json(tmp_path, number):
         ),
         (
             {"intrinsics": INTRINSICS | {"cx": 29.5, "cy": 39.5}},
-            "camera: cx 29.5 and cy 39.5 look exchanged, as its images have 80 x 60 pixels",
+            "camera: cx, cy are 29.5, 39.5, for an image of 80 x 60 pixels",
         ),
     ],
 )
