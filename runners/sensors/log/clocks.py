@@ -16,6 +16,8 @@ from runners.sensors.rig import ClockRig
 
 _NANOSECONDS = 1e9
 _END_OF_TIME = 2**63 - 1
+_LEAST_STEP = 0.1  # s: images of a moving camera that are off by less are off by millimetres
+_STEADY = 5  # messages before and after a step of a clock, which show that it is none of latency
 SLACK = 1_000_000_000  # ns of the log's time that a message waits for those before it
 
 
@@ -46,6 +48,7 @@ class Clocks:
         """What must be added to the times of each topic, by all messages so far."""
         medians: dict[str, int] = {}
         several: dict[str, list[int]] = {}
+        small_steps: dict[str, float] = {}  # seconds
         limit = round(self._rig.offset * _NANOSECONDS)
         for topic in self._times:
             log_times, stamps = (times[self.of(topic)[1] != 0] for times in self.of(topic))
@@ -54,6 +57,8 @@ class Clocks:
                 medians[topic] = offsets[0]
                 if len(offsets) > 1:
                     several[topic] = offsets
+                elif (step := largest_step(log_times, stamps)) != 0.0:
+                    small_steps[topic] = step
         if self._rig.stamp == "log" or not medians:
             return ClockCorrection(by_log=True)
         ordered = sorted(medians.values())
@@ -69,6 +74,11 @@ class Clocks:
         warnings = [
             f"the clock of {topic} is {_seconds(-shift)} other topics': its stamps are shifted"
             for topic, shift in sorted(shifts.items())
+        ]
+        warnings += [
+            f"stamps on {topic} jump by {step:+.3g} s against the log's clock, which is less than "
+            "clock.offset: they are used as they are; check the sender's clock, or set clock.offset"
+            for topic, step in sorted(small_steps.items())
         ]
         steps = {}
         for topic, offsets in sorted(several.items()):
@@ -147,6 +157,23 @@ def clock_offsets(log_times: IntArray, stamps: IntArray, limit: int) -> list[int
         clocks[start:end] = clock
         alone = end - start == 1
     return [_lower_median(offsets[clocks == clock]) for clock in range(clocks.max() + 1)]
+
+
+def largest_step(log_times: IntArray, stamps: IntArray) -> float:
+    """Return the largest lasting step of stamps (N,) against the log's times (N,), seconds.
+
+    0 if there is none: messages that come late have the same offset before them and after them, and
+    a latency that varies is as large within the messages before and after as between them.
+    """
+    offsets = (stamps - log_times) / _NANOSECONDS
+    changes = np.abs(np.diff(offsets))[_STEADY - 1 : -_STEADY + 1]
+    if len(changes) == 0:
+        return 0.0
+    last = _STEADY - 1 + int(changes.argmax())  # before the step
+    before, after = offsets[last + 1 - _STEADY : last + 1], offsets[last + 1 : last + 1 + _STEADY]
+    step = float(np.median(after) - np.median(before))
+    varies = max(float(np.ptp(before)), float(np.ptp(after)))
+    return step if abs(step) > max(_LEAST_STEP, 3.0 * varies) else 0.0
 
 
 def _lower_median(values: IntArray) -> int:

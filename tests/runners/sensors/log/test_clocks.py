@@ -67,6 +67,27 @@ def test_clocks_that_depart_are_shifted(offsets, shifts, said):
     assert unstamped / SECOND == pytest.approx(7.0 + typical * (abs(typical) > 1.0), abs=0.02)
 
 
+@pytest.mark.parametrize(
+    ("offsets", "step"),
+    [
+        ([0.0] * 6 + [0.6] * 6, "+0.6"),
+        ([0.0] * 6 + [-0.2] * 6, "-0.2"),
+        ([0.0] * 6 + [0.05] * 6, None),  # a moving hand is off by millimetres
+        ([0.0] * 6 + [-0.6] * 2 + [0.0] * 6, None),  # two come late
+        ([0.0, -0.6] * 8, None),  # of two senders
+        ([0.0] * 4 + [-0.6] * 3, None),  # too few to tell
+    ],
+)
+def test_a_lasting_step_of_a_clock_below_the_limit_is_said(offsets, step):
+    clocks = Clocks(ClockRig())
+    for number, offset in enumerate(offsets):
+        clocks.add(received("/camera", number, number + offset))
+    correction = clocks.correction()
+    said = [] if step is None else [f"stamps on /camera jump by {step} s against the log's clock"]
+    assert [text.split(", which")[0] for text in correction.warnings] == said
+    assert correction.time(received("/camera", 11.0, 11.6)) == BEGIN + round(11.6 * SECOND)
+
+
 def test_the_logs_times_count_for_all_if_told_so():
     correction = gathered({"/a": 90.0, "/b": 0.0}, ClockRig(stamp="log")).correction()
     assert correction.time(received("/a", 3.0, 93.0)) == BEGIN + 3 * SECOND
