@@ -129,14 +129,14 @@ def refuse_special_file(name: str, path: Path, error: type[ChselError]) -> None:
     """Raise `error` if `path` is a FIFO, a socket or a device, a link to one, or of Git LFS.
 
     name: of the file in the message, such as "recording a.mcap". Other paths pass, also those that
-    do not exist or cannot be opened.
+    do not exist, cannot be opened, or are no paths, such as texts with NUL.
     """
     if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
         raise error(f"{name} is a FIFO, a socket or a device; accepted: a file")
     try:
         with open(path, "rb") as file:
             pointer = file.read(len(_LFS)) == _LFS
-    except OSError:
+    except (OSError, ValueError):
         return
     if pointer:
         raise error(f"{name} is a pointer of Git LFS, not its data; run `git lfs pull` first")

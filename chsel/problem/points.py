@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Self
@@ -29,6 +29,7 @@ from chsel.numerics.cell_set import bounds_of, set_voxels
 from chsel.problem.sdf_grid import SdfGrid
 
 FREE_RESOLUTION = 0.01  # side of a voxel of free space, metres
+_FEW = 300  # points whose distances take less time than importing and building a tree
 FARTHEST_PLACE = 1e5  # coordinates in the world, metres: turned, they are still within FARTHEST
 MANY_REPEATED = 0.1  # share of points at places that were measured before
 SAME_PLACE = 0.003  # metres: contacts nearer to an earlier one measure the same place again
@@ -249,31 +250,41 @@ def distinct_points(
 
 def away_from(points: FloatArray, earlier: FloatArray, apart: float) -> BoolArray:
     """Which points (N, k) are farther than `apart` from all earlier ones (M, k)."""
-    from scipy.spatial import cKDTree
-
     if len(points) == 0 or len(earlier) == 0:
         return np.ones(len(points), dtype=bool)
+    if len(points) * len(earlier) <= _FEW**2:
+        away = points[:, None] - earlier
+        return np.asarray(((away**2).sum(axis=2) > apart**2).all(axis=1))
+    from scipy.spatial import cKDTree
+
     return np.asarray(cKDTree(earlier).query(points)[0] > apart)
 
 
 def first_at_place(points: FloatArray, earlier: FloatArray, apart: float) -> BoolArray:
     """Which points (N, k) are farther than `apart` from all earlier ones (M, k) and kept ones."""
-    from scipy.spatial import cKDTree
-
     first = away_from(points, earlier, apart)
     left = np.flatnonzero(first)
     left = left[np.sort(np.unique(points[left], axis=0, return_index=True)[1])]
     first[:] = False
     first[left] = True
-    if len(left) < 2:
-        return first
-    tree = cKDTree(points[left])
-    beside = tree.query(points[left], k=2)[0][:, 1] <= apart
-    for n in np.flatnonzero(beside):
-        if first[left[n]]:
-            first[left[tree.query_ball_point(points[left[n]], apart)]] = False
-            first[left[n]] = True
+    near = _near(points[left], apart)
+    for n, row in enumerate(left):
+        if first[row]:
+            first[left[near(n)]] = False
+            first[row] = True
     return first
+
+
+def _near(points: FloatArray, apart: float) -> Callable[[int], Any]:
+    """A function of n that returns which of points (N, k) are up to `apart` from the n-th one."""
+    if len(points) <= _FEW:
+        away = points[:, None] - points
+        within = (away**2).sum(axis=2) <= apart**2
+        return lambda n: within[n]
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points)
+    return lambda n: tree.query_ball_point(points[n], apart)
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ _WALL_SHARE = 0.05  # of the surface on thin walls that is worth a warning
 _PART_NODES = 250_000  # least number of nodes that are sampled at once
 _PART_FACES = 5  # faces per node of a part: preparing 1.3 million costs as much as 65 000 nodes
 _WHOLE = 1e-6  # relative; from whole winding numbers the distance has its rounding by libigl
+_ON_SURFACE = 1e-12  # metres; nearer to the surface, winding numbers are rounding errors
 _NORMAL_RANGE = 1e-3  # metres; nearer to the surface, the face normal is the better gradient
 
 
@@ -72,7 +73,7 @@ def _mesh_sdf(
     distance = np.sqrt((away**2).sum(axis=1))
     # Of a closed mesh it is the distance times 1 - 2 w, with a winding number w of 0 or 1.
     signed = np.where(
-        np.abs(np.abs(weighted) - distance) <= _WHOLE * distance,
+        np.abs(np.abs(weighted) - distance) <= _WHOLE * distance + closed * _ON_SURFACE,
         np.where(inside, -1.0, 1.0) * np.abs(weighted),
         np.where(inside, -1.0, 1.0) * distance,
     )
@@ -82,7 +83,7 @@ def _mesh_sdf(
     normal = np.cross(b - a, c - a)  # from positions: normals in a mesh file may differ
     length = np.sqrt((normal**2).sum(axis=1, keepdims=True))
     gradient[near] = normal / np.maximum(length, 1e-300)
-    return signed, gradient, closed & (weighted < -2.0 * distance)
+    return signed, gradient, closed & (weighted < -2.0 * distance - _ON_SURFACE)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -30,10 +30,9 @@ from chsel.numerics.arrays import digest
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import compose, random_rotations
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from replay.mcap.writer import McapRecorder
-from tests.tools.small_recordings import steered_session
+from tests.tools.small_recordings import coarse_grid, steered_session
 
 WORKSPACE = Workspace((-0.3, -0.3, 0.0), (0.3, 0.3, 0.5))
 FREE_RESOLUTION = 0.02
@@ -51,7 +50,7 @@ def example_events(*, steps=3, elites=12, free=40, snapshots=2):
         seed=2**64 - 1,
         config={"object": {"name": "电钻", "scale": 1.5}, "flags": [True, None, -1, 1e-300]},
         mesh=mesh,
-        sdf=SdfGrid.from_mesh(mesh, 0.02, padding=0.03),
+        sdf=coarse_grid(mesh),
         workspace=WORKSPACE,
         free_resolution=FREE_RESOLUTION,
         initial_points=KnownPoints(free=random.normal(size=(free, 3))),

@@ -166,7 +166,7 @@ def test_a_mistake_is_one_line(server):
             "record is 'a\\x00.mcap'; accepted: a name, of a file",
         ),
         ("/sessions", {"record": f"{'a' * 5000}.mcap"}, f"recording {folder}/aaaa"),
-        ("/sessions", {"target": "a\0.obj"}, "mesh file a\0.obj does not exist; accepted: "),
+        ("/sessions", {"target": "a\0.obj"}, "mesh file a\\x00.obj does not exist; accepted: "),
         ("/sessions", {"target": f"{'a' * 5000}.obj"}, ""),
         ("/sessions", {"method": "a" * 5000}, "method is "),
     ):

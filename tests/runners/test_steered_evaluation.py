@@ -223,7 +223,7 @@ def test_a_policy_has_the_changes_of_all_and_its_own():
         (["methods=[anchored,icp]"], "policies have 2 methods"),
         (["methods=chsel"], "methods is ['chsel'], was ['anchored']"),
         (["steps=1"], "steps=1"),
-        (["policies=null"], "steered is False, was True"),
+        (["policies=null"], "policy.probes has no effect: policies is null"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )

@@ -88,8 +88,8 @@ def test_a_session_ends_with_a_sure_grasp_and_says_how_sure_it_is_of_each_mode(t
     """A can of 26 cm by 15 cm, held across by very wide fingers, is within them in any pose."""
     down = np.diag([1.0, -1.0, -1.0, 1.0])
     file = tmp_path / "grasps.npz"
-    np.savez(file, object_from_gripper=down[None], width=3.0)
-    grasp = (f"grasp.path={file}", "grasp.gripper.opening=4", "grasp.gripper.length=0.1")
+    np.savez(file, object_from_gripper=down[None], width=1.9)
+    grasp = (f"grasp.path={file}", "grasp.gripper.opening=2", "grasp.gripper.length=0.1")
     done, recording, summary = steered(tmp_path, "policy=information", *grasp)
     assert "stopped: a grasp works with a chance of" in done.stdout
     last = summary["steps"][-1]
