@@ -131,7 +131,27 @@ def _there_and_back(
         middles = first + np.flatnonzero(brisk[first : last + 1])
         disputed[middles[0] : middles[-1] + 3] = True
     outliers[1:-1] = back & (least > _SUDDEN * squared)
+    for length in range(2, min(_FEW, len(left) - 2) + 1):
+        outliers |= _short_visits(distances, left, steps=steps, seconds=seconds, length=length)
     return outliers & ~disputed, disputed
+
+
+def _short_visits(
+    distances: Distances, left: IntArray, *, steps: FloatArray, seconds: FloatArray, length: int
+) -> BoolArray:
+    """Which of samples `left` (L,) are among `length` ones at one place, left as suddenly as met.
+
+    steps, seconds (L - 1,): from each sample to the next one.
+    """
+    least = np.minimum(steps[:-length], steps[length:])
+    between = np.max([steps[k : k - length] for k in range(1, length)], axis=0)
+    visits = (least > 1.0) & (between < _SLOW * least)
+    visits &= least > _SUDDEN * seconds[:-length] * seconds[length:]
+    visits &= _is_back(distances, left[: -length - 1], left[length + 1 :], least)
+    found = np.zeros(len(left), dtype=bool)
+    for first in np.flatnonzero(visits).tolist():
+        found[first + 1 : first + 1 + length] = True
+    return found
 
 
 def _is_back(

@@ -76,6 +76,16 @@ def test_what_a_tracker_sends_without_a_target_is_left_out(tmp_path, way, place,
     assert f"goes there and back faster than 3 m/s or 10 rad/s: {len(lost)} of 101 sam" in told
 
 
+@pytest.mark.parametrize("lost", [[50], [50, 51], [50, 51, 52], [20, 21, 70, 71, 72]])
+def test_a_short_visit_close_by_is_left_out(tmp_path, way, lost):
+    """50 mm in 20 ms are 2.5 m/s, below the limit, from a stand and to one."""
+    aside = np.array([0.0, 0.05, 0.0])
+    samples = [(s, at + aside if n in lost else at) for n, (s, at) in enumerate(WAY)]
+    free, told = swept(tmp_path, samples)
+    assert free == way
+    assert f"{len(lost)} of 101 samples are left out" in told
+
+
 def test_a_rotation_that_flips_is_left_out(tmp_path, way):
     turned = compose(axis_angle(np.array([0.0, 0.0, 1.0]), 2.0), THERE)
     free, told = swept(tmp_path, [*WAY[:50], (WAY[50][0], turned), *WAY[51:]])
