@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 SMALLEST = 0.005  # metres; objects that a gripper probes have a larger extent
 LARGEST = 10.0  # metres; a larger extent is probably in millimetres
 _ACCEPTED = "accepted: a mesh in metres, such as .stl, .obj, .ply, .glb, .dae, .3mf or .off"
+_FAR = 3.0  # diameters from a mesh to the origin of its frame, up to which searches find poses
 _NEAR = 0.5  # largest gap between the bodies of one object, in diameters of the largest body
 _MOST_BODIES = 1000  # that are compared, the largest ones
 
@@ -147,7 +148,7 @@ def clean_mesh(
             "distances are those to the surface"
         )
         found.append(MeshWarning("open_mesh", text))
-    for warning in found + check_bodies(mesh, name):
+    for warning in found + check_bodies(mesh, name) + check_frame(mesh, name):
         warnings.warn(warning, stacklevel=2)
     return mesh
 
@@ -183,6 +184,20 @@ def check_bodies(mesh: trimesh.Trimesh, name: str) -> list[MeshWarning]:
         "they are registered as one rigid object: remove what is not part of it"
     )
     return [MeshWarning("bodies_apart", text)]
+
+
+def check_frame(mesh: trimesh.Trimesh, name: str) -> list[MeshWarning]:
+    """A warning if a mesh (metres) lies far from the origin of its frame."""
+    away = float(np.sqrt((mesh.bounds.mean(axis=0) ** 2).sum()))
+    diameter = float(np.sqrt((mesh.extents**2).sum()))
+    if away <= _FAR * diameter:
+        return []
+    text = (
+        f"{name} lies {away:.3g} m from the origin of its frame, and is {diameter:.3g} m large: "
+        "searches look for that origin around the workspace, and may miss the pose; move the mesh "
+        "to its origin"
+    )
+    return [MeshWarning("far_frame", text)]
 
 
 def _check_size(name: str, extents: np.ndarray, hint: str) -> None:

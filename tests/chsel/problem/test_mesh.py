@@ -42,6 +42,17 @@ def test_a_scene_becomes_one_mesh_with_its_parts_in_place(tmp_path):
     assert mesh.volume == pytest.approx(0.012, rel=1e-6)
 
 
+@pytest.mark.parametrize(("away", "warned"), [(0.0, False), (0.4, False), (0.8, True)])
+def test_a_mesh_far_from_its_frame_is_a_warning(away, warned):
+    """A body of 0.15 m: searches bound where the frame's origin is."""
+    mesh = trimesh.creation.box((0.1, 0.1, 0.05)).apply_translation((away, 0.0, 0.0))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        clean_mesh(mesh.vertices, mesh.faces, name="part")
+    assert [each.message.code for each in caught] == ["far_frame"] * warned
+    assert not warned or "part lies 0.8 m from the origin of its frame" in str(caught[0].message)
+
+
 def test_bodies_far_apart_are_counted_and_parts_near_one_another_one_object_however_many():
     """A row of parts is longer than what is far apart, and no two neighbours are."""
     two = trimesh.util.concatenate([BOX, moved(BOX, 0.05, 0.0, 0.0), moved(BOX, 0.0, 1.0, 0.0)])
