@@ -52,8 +52,8 @@ class CheckedMotion:
         disputed = int(self.disputed.sum())
         many = ", perhaps those of a second publisher" if outliers > _MANY * len(self.kept) else ""
         texts = {
-            f"{name} goes there and back faster than {limits}: {outliers} of "
-            f"{len(self.kept)} samples are left out{many}": outliers,
+            f"{name} goes there and back faster than {limits}, or more suddenly than any arm: "
+            f"{outliers} of {len(self.kept)} samples are left out{many}": outliers,
             f"{name} alternates between places that are too far apart, as if two publishers sent "
             f"it: {disputed} of {len(self.kept)} samples are left out; record one of them, or "
             "raise max_speed and max_turn of the rig": disputed,
@@ -146,7 +146,8 @@ def _short_visits(
     least = np.minimum(steps[:-length], steps[length:])
     between = np.max([steps[k : k - length] for k in range(1, length)], axis=0)
     visits = (least > 1.0) & (between < _SLOW * least)
-    visits &= least > _SUDDEN * seconds[:-length] * seconds[length:]
+    # A robot that turns round may take so many intervals for it.
+    visits &= least > _SUDDEN * length * seconds[:-length] * seconds[length:]
     visits &= _is_back(distances, left[: -length - 1], left[length + 1 :], least)
     found = np.zeros(len(left), dtype=bool)
     for first in np.flatnonzero(visits).tolist():
