@@ -289,5 +289,4 @@ def _policy(info: Mapping[str, Any]) -> str:
     text = f"{info['policy']['name']}, decisions {info['messages']['/decision']}, "
     if spread is None:
         return f"{text}none after the last probe"
-    ended = f"stopped by {stop}" if stop else "not stopped"
-    return f"{text}{ended}, spread of the poses {1000.0 * spread:.1f} mm"
+    return text + (f"stopped by {stop}" if stop else "not stopped")

@@ -113,7 +113,7 @@ class Display:
         text = f"probe {row['step']:>3} {row['outcome']:<7} {row['contacts']:>3} contacts"
         text += f" {row['free_points']:>6} free"
         if "set_spread" in row:
-            text += f"  spread {1000.0 * row['set_spread']:5.1f} mm  {row['verdict']:<14}"
+            text += f" spread {1000.0 * row['set_spread']:5.1f} mm {row['verdict']:<13}"
         self.say(f"{text} {row['seconds']:>5.2f} s")
 
     def warn(self, warnings: Iterable[InputWarning | StepWarning]) -> None:
