@@ -58,11 +58,21 @@ class Steering:
         """
         require_parts(points=points)
         key = StreamKey(self.seed, done)
-        known = self.sdf, points, self.workspace, self.free_resolution
         belief = self.belief(points, hypotheses, key)
         trust = None if hypotheses is None else hypotheses.trust
         verdict = "" if trust is None else trust.verdict
-        problem = DecisionProblem(*known, belief, self.actions, available, self.hand, key, verdict)
+        problem = DecisionProblem(
+            self.sdf,
+            points,
+            workspace=self.workspace,
+            free_resolution=self.free_resolution,
+            belief=belief,
+            actions=self.actions,
+            available=available,
+            hand=self.hand,
+            key=key,
+            verdict=verdict,
+        )
         decision = self.policy.decide(problem)
         _check(problem, decision)
         self.last = Choice(problem, decision)

@@ -49,7 +49,9 @@ class _Parts:
 
     def __init__(self, mesh: trimesh.Trimesh, labels: IntArray, name: str) -> None:
         """labels (F,): the part of each face."""
-        self._mesh, self._name, self._labels = mesh, name, labels
+        self._mesh = mesh
+        self._name = name
+        self._labels = labels
         self._vertices = np.asarray(mesh.vertices)
         self._faces = np.array(mesh.faces)  # as turned
         self._count = int(labels.max()) + 1

@@ -154,7 +154,7 @@ class Workspace:
 def world_points(name: str, given: Any) -> FloatArray:
     """Points (N, 3) as a program or a file gives them, metres; none for None.
 
-    Raises PointsError for what is not such an array, and places beyond FARTHEST_PLACE.
+    Raises PointsError unless it is such an array, and for places beyond FARTHEST_PLACE.
     """
     given = _no_points() if given is None else given
     return frozen(name, given, (None, 3), most=FARTHEST_PLACE)

@@ -104,18 +104,22 @@ def trust_in(
     near = apart <= gap
     count, mode = _components(near & ~turned(sdf, poses, near))
     parts = [np.flatnonzero(mode == one) for one in range(count)]
-    redundancy, why = max(len(off) - FREEDOMS, 0), ""
+    redundancy = max(len(off) - FREEDOMS, 0)
+    why = ""
     worst = max(MOST_NOISE, LEAST_LEVELS * sensor_noise)
     if error > limit or noise.outliers > MOST_OUTLIERS or noise.sigma > worst:
-        count, verdict = 0, NOTHING
+        verdict = NOTHING
     elif not sdf.has_inside or LEAST_LEVELS * sdf.surface_error > width:
-        count, verdict, why = 0, WIDE, "the SDF grid is too coarse for the object"
+        verdict = WIDE
+        why = "the SDF grid is too coarse for the object"
     elif redundancy + len(points.free) + len(points.occupied) == 0:
-        count, verdict, why = 0, WIDE, "no more contacts than a pose can fit"
+        verdict = WIDE
+        why = "no more contacts than a pose can fit"
     elif count > MOST_MODES:
-        count, verdict, why = 0, WIDE, f"{count} groups of poses"
+        verdict = WIDE
+        why = f"{count} groups of poses"
     elif max(surface_spread(apart[np.ix_(part, part)]) for part in parts) > width:
-        count, verdict = 0, WIDE
+        verdict = WIDE
     else:
         bests = [poses[part[:1]] for part in parts]
         cost = min(motion_cost(problem, pose, sensor_noise, width) for pose in bests)
@@ -123,21 +127,21 @@ def trust_in(
             least = max(cost, 0.0)
             why = f"moving it {1000.0 * width:.1f} mm costs {least:.1f} nats, wide up to {LIMIT:g}"
         verdict = WIDE if cost <= LIMIT else DETERMINED if count == 1 else SEVERAL
-        count = 0 if verdict == WIDE else count
-    misfit, spread = error / sensor_noise, surface_spread(apart)
+    if verdict in (NOTHING, WIDE):
+        count = 0  # groups of such poses are no modes
     firsts = [int(indices[part[0]]) for part in parts[: max(count, 1)]]
     best = tuple(index for index in firsts if index >= 0)
     twins = _largest_turn(poses, apart, parts) if verdict == SEVERAL and near.all() else None
     return Trust(
-        noise.sigma,
-        noise.outliers,
-        misfit,
-        count,
-        spread,
-        verdict,
-        redundancy,
-        best,
-        twins,
+        noise=noise.sigma,
+        outliers=noise.outliers,
+        misfit=error / sensor_noise,
+        modes=count,
+        spread=surface_spread(apart),
+        verdict=verdict,
+        redundancy=redundancy,
+        best_of_modes=best,
+        twins=twins,
         limit=width,
         reason=why,
     )

@@ -116,7 +116,12 @@ def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:
     else:
         mesh = load_model(config.name, config.scale)
     return ObjectModel(
-        config.name, mesh, config.scale, config.epsilon, config.configuration, _of_paper(config)
+        config.name,
+        mesh,
+        scale=config.scale,
+        epsilon=config.epsilon,
+        configuration=config.configuration,
+        of_paper=_of_paper(config),
     )
 
 

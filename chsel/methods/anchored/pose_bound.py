@@ -54,7 +54,14 @@ def _left(sdf: SdfGrid, centre: FloatArray, turns: FloatArray) -> FloatArray:
     identity = np.eye(4)[None]
     around = Workspace(tuple(sdf.bounds[0]), tuple(sdf.bounds[1]))
     surface = KnownPoints(known=outline_in_object(sdf))
-    itself = RegistrationProblem(sdf, surface, identity, around, sdf.resolution, StreamKey(0, 0))
+    itself = RegistrationProblem(
+        sdf,
+        surface,
+        initial_set=identity,
+        workspace=around,
+        free_resolution=sdf.resolution,
+        key=StreamKey(0, 0),
+    )
     energy = Energy(itself, surface, noise_model(_SOFT * sdf.diameter))
     turned = Poses.of(compose(turns, centre - rotated(turns, centre)))
     fits = fitted(energy, twists_of(SE3Space(), centre), turned, _STEPS)

@@ -139,7 +139,9 @@ def clock_offsets(log_times: IntArray, stamps: IntArray, limit: int) -> list[int
     starts = [0, *(np.flatnonzero(np.abs(np.diff(offsets)) > limit) + 1).tolist()]
     clocks = np.zeros(len(offsets), dtype=np.int64)  # number of the clock of each message
     met: list[tuple[int, int]] = []  # typical offsets of runs of messages, and their clocks
-    clock, count, alone = 0, 1, True
+    clock = 0
+    count = 1  # of clocks
+    alone = True  # whether the run before has a single message
     for start, end in zip(starts, [*starts[1:], len(offsets)], strict=True):
         typical = _lower_median(offsets[start:end])
         known = next((number for offset, number in met if abs(offset - typical) <= limit), None)

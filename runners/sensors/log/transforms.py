@@ -238,7 +238,9 @@ class _Edge:
 
     def check_motion(self, child: str, limits: MotionLimits) -> list[str]:
         """Leave out samples that are not plausible; what a user should know of them."""
-        times, positions, turns = self.times, self._positions, self._quaternions
+        times = self.times
+        positions = self._positions
+        turns = self._quaternions
         if self._contradicting is not None:
             others, self._contradicting = self._contradicting, None
             order = np.argsort(np.concatenate([times, others[0]]), kind="stable")

@@ -194,7 +194,7 @@ def test_two_topics_of_one_transform_are_both_named(tmp_path):
 
 
 def history(*positions, sliding=("finger",), every=0.02):
-    """Positions of a joint at multiples of `every` seconds, and what is told of them."""
+    """Positions of a joint at multiples of `every` seconds, and warnings about them."""
     joints = JointHistory(["finger"], sliding)
     for index, value in enumerate(positions):
         time = round(index * every * SECOND)
