@@ -29,7 +29,7 @@ MESHES = {
     "1 m": bracket().apply_scale(1.0 / 0.080),
     "plate": trimesh.creation.box((0.1, 0.07, 0.004)),
     "rod": trimesh.creation.cylinder(0.004, 0.3),
-    "ball": trimesh.creation.icosphere(3, 0.02),
+    "ball": trimesh.creation.icosphere(2, 0.02),
 }
 
 
