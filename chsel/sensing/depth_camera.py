@@ -322,7 +322,14 @@ def depth_look(
             )
         surface = one_per_voxel(apply(pose, camera.back_project(depth)[on_object]), side)
         rays &= on_object | ~mask
-    return DepthLook(camera, pose, depth, np.maximum(depth - before, 0.0), rays, surface)
+    return DepthLook(
+        camera,
+        pose,
+        depth=depth,
+        ends=np.maximum(depth - before, 0.0),
+        rays=rays,
+        surface=surface,
+    )
 
 
 def one_per_voxel(points: FloatArray, side: float) -> FloatArray:

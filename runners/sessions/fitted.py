@@ -32,7 +32,9 @@ def fitted_configuration(mesh: trimesh.Trimesh, hand: ProbingHand) -> Configurat
     from the side. Probes are spread over the width and height of its box and of the foremost part
     of the hand. The workspace is its box, padded by its diameter, but hardly below it.
     """
-    flat = Configuration(FITTED, "", (), (), (0.0, 0.0, 0.0), (0.0, 0.0, _YAW))
+    flat = Configuration(
+        FITTED, "", y=(), z=(), position=(0.0, 0.0, 0.0), rotation=(0.0, 0.0, _YAW)
+    )
     placed = apply(laid_down(mesh, flat), np.asarray(mesh.vertices))
     solids = np.array([solid.bounds for solid in hand.solids])  # (S, 2, 3), x forward
     foremost = solids[np.argmax(solids[:, 1, 0])]
