@@ -10,6 +10,7 @@ from .errors import ChselError as ChselError
 from .errors import InputWarning as InputWarning
 from .errors import MeshWarning as MeshWarning
 from .errors import PointsWarning as PointsWarning
+from .events import Probe as Probe
 from .methods import build_method as build_method
 from .next_probe.action_lattice import ActionSettings as ActionSettings
 from .next_probe.action_lattice import around_actions as around_actions
@@ -22,9 +23,7 @@ from .next_probe.decision_problem import DecisionProblem as DecisionProblem
 from .next_probe.decision_problem import HandShape as HandShape
 from .numerics.threads import set_threads as set_threads
 from .policies import build_policy as build_policy
-from .policies.steering import Steering as Steering
 from .problem.mesh import load_mesh as load_mesh
-from .problem.online_registration import OnlineRegistration as OnlineRegistration
 from .problem.points import KnownPoints as KnownPoints
 from .problem.points import Workspace as Workspace
 from .problem.pushes import Pushes as Pushes
@@ -38,8 +37,10 @@ from .sensing.depth_camera import PinholeCamera as PinholeCamera
 from .sensing.free_space import FreeGrid as FreeGrid
 from .sensing.free_space import interior_lattice as interior_lattice
 from .sensing.free_space import poses_between as poses_between
-from .session import NextProbe as NextProbe
-from .session import Session as Session
+from .session.judging import trust_by as trust_by
+from .session.loop import Loop as Loop
+from .session.session import NextProbe as NextProbe
+from .session.session import Session as Session
 from .which_object import Candidate as Candidate
 from .which_object import WhichObject as WhichObject
 

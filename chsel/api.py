@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,16 +15,9 @@ from chsel.errors import (
     require_instance,
     require_metres,
 )
-from chsel.methods import (
-    MOST_NOISE,
-    build_method,
-    default_method,
-    noise_of,
-    preset_settings,
-    trust_by,
-)
+from chsel.methods import MOST_NOISE, build_method, default_method, method_settings
+from chsel.problem.initial_sets import posed_problem
 from chsel.problem.mesh import clean_mesh
-from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import (
     FREE_RESOLUTION,
     KnownPoints,
@@ -39,15 +30,15 @@ from chsel.problem.points import (
     require_parts,
     same_place,
     workspace_around,
-    world_known_points,
-    world_points,
 )
 from chsel.problem.poses import inverse
 from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import Hypotheses, Observer
 from chsel.problem.sdf_grid import SdfGrid, object_grid
-from chsel.problem.settings import changed_settings
+from chsel.problem.streams import StreamKey
 from chsel.problem.trust import check_trust
+from chsel.session.judging import noise_of, trust_by
+from chsel.session.perception import known_points, refuse_surface
 
 if TYPE_CHECKING:
     import trimesh
@@ -80,8 +71,8 @@ def register(
 
     target: the object's mesh in metres, or its signed distance grid. contacts (M, 3), free (N, 3),
     occupied (K, 3): points on, outside and inside of the object. known (L, 3), known_sdf (L,):
-    points of known signed distance, metres. Numpy arrays, torch tensors or lists. surface: another
-    name of contacts. A place on the object that is measured again counts once.
+    points of known signed distance, metres. Numpy arrays, torch tensors or lists. A place on the
+    object that is measured again counts once. surface: refused, the former name of contacts.
     method, preset: see chsel.methods; by default `anchored`, and in the presets paper and reference
     `chsel`, their method. settings: a mapping of single settings over the preset's, such as
     {"size": "large"}, or a whole settings object.
@@ -97,15 +88,17 @@ def register(
     Returns hypotheses with costs, best first, repeated poses flagged, and with `trust`: how far to
     trust them, see `trust_in`; None if an installed method finds no pose.
     Raises ChselError, with what is accepted, for malformed input; at least one point is needed.
-    Warns with PointsWarning about points that are hardly meant, and where no hypothesis explains
-    them, see chsel.problem.points and chsel.problem.trust.
+    Warns with PointsWarning about suspicious points, and where no hypothesis explains them, see
+    chsel.problem.points and chsel.problem.trust.
     """
     if unnamed:
         raise PointsError("points have no name; accepted: chsel.register(mesh, contacts=points)")
-    if contacts is not None and surface is not None:
-        raise PointsError("contacts and surface are two names of the same; accepted: one of them")
-    contacts = surface if contacts is None else contacts
-    given = _known_points(contacts, free=free, occupied=occupied, known=known, known_sdf=known_sdf)
+    refuse_surface(surface)
+    given = known_points(
+        contacts=contacts, free=free, occupied=occupied, known=known, known_sdf=known_sdf
+    )
+    if given.count == 0:
+        raise PointsError("no point was given; accepted: contacts, free, occupied or known points")
     if workspace is not None:
         require_parts(workspace=workspace)
     if previous is not None:
@@ -124,16 +117,15 @@ def register(
     if workspace is not None:
         _warn(check_workspace(workspace, sdf.diameter))
     workspace = workspace or workspace_around(points, sdf)
-    online = OnlineRegistration(
+    problem = posed_problem(
         sdf,
-        workspace,
-        free_resolution,
-        solver.online,
-        seed=seed,
-        points=points,
+        points,
+        workspace=workspace,
+        free_resolution=free_resolution,
+        key=StreamKey(seed, step),
+        settings=solver.online,
         previous=previous,
     )
-    problem = online.pose(step)
     if initial_set is not None:
         problem = replace(problem, initial_set=initial_set)
         places = inverse(problem.initial_set)[:, :3, 3]
@@ -155,15 +147,6 @@ def _warn(points_warnings: list[PointsWarning]) -> None:
         warnings.warn(warning, stacklevel=3)
 
 
-def _known_points(contacts: Any, **others: Any) -> KnownPoints:
-    """All classes together; None stands for no points."""
-    touched = KnownPoints(known=world_points("contacts", contacts))
-    points = touched.merged(world_known_points(**others))
-    if points.count == 0:
-        raise PointsError("no point was given; accepted: contacts, free, occupied or known points")
-    return points
-
-
 def _grid(target: trimesh.Trimesh | SdfGrid, resolution: float | None) -> SdfGrid:
     if isinstance(target, SdfGrid):
         return target
@@ -177,17 +160,3 @@ def _grid(target: trimesh.Trimesh | SdfGrid, resolution: float | None) -> SdfGri
             "a Trimesh, or a SdfGrid"
         )
     return object_grid(clean_mesh(target.vertices, target.faces, name="target"), resolution)
-
-
-def method_settings(method: str, preset: str, *changes: Any) -> Any:
-    """The preset's settings with changes laid over them: mappings, or whole settings objects."""
-    chosen = preset_settings(method, preset)
-    for change in changes:
-        if dataclasses.is_dataclass(change) and not isinstance(change, type):
-            chosen = change
-        elif change is not None:
-            require_instance(
-                "settings", change, Mapping, "a mapping, or the settings of the method"
-            )
-            chosen = changed_settings(chosen, change, f"method={method}: settings")
-    return chosen

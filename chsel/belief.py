@@ -1,4 +1,4 @@
-"""What a set of hypotheses says about an object: where it can be, and whether an action would work.
+"""Beliefs about an object from hypotheses: where it can be, and whether an action would work.
 
 All members count alike. So a chance is the share of the members for which something holds, with
 Wilson's interval for their number (Wilson, 1927).
@@ -75,7 +75,7 @@ class Mode:
 
     @property
     def world_from_object(self) -> FloatArray:
-        """Where the best member has the object in the world (4, 4)."""
+        """Pose (4, 4) of the object in the world by the best member."""
         return inverse(self.object_from_world)
 
     @property
@@ -152,7 +152,7 @@ class PoseBelief:
         self._known: list[Mode] = self.modes or ([] if previous is None else previous._known)
 
     def _modes(self, firsts: IntArray, previous: PoseBelief | None) -> list[Mode]:
-        """Each member is of the mode whose best is nearest, and not turned against it."""
+        """Return the modes; a member is of that whose best is nearest and not turned against it."""
         if len(firsts) == 0:
             return []
         apart = outline_distances(self._sdf, self._poses)
@@ -170,7 +170,7 @@ class PoseBelief:
         return found
 
     def _numbers(self, firsts: IntArray, previous: PoseBelief | None) -> list[int]:
-        """Numbers of modes: those of the nearest before, or new ones."""
+        """Return numbers of modes: those of the nearest before, or new ones."""
         before = [] if previous is None else previous._known
         given: dict[int, int] = {}
         if before:
@@ -191,11 +191,11 @@ class PoseBelief:
 
     @property
     def world_from_object(self) -> FloatArray:
-        """Where the members have the object in the world (K, 4, 4)."""
+        """Poses (K, 4, 4) of the object in the world, by the members."""
         return inverse(self.object_from_world)
 
     def event(self, step: int) -> Believed:
-        """As recordings of a session have it."""
+        """Return the belief as recordings of a session have it."""
         poses = np.array([mode.object_from_world for mode in self.modes]).reshape(-1, 4, 4)
         return Believed(
             step,
@@ -227,21 +227,21 @@ class PoseBelief:
         return "\n  ".join(lines) + ">"
 
     def sample(self, count: int, seed: int = 0) -> FloatArray:
-        """Poses object_from_world (count, 4, 4) of members, drawn alike."""
+        """Return poses object_from_world (count, 4, 4) of members, drawn alike."""
         chosen = np.random.default_rng(seed).integers(len(self), size=count)
         return self.object_from_world[chosen]
 
     def occupancy(self, points: Any) -> FloatArray:
-        """The chance (N,) that each of points (N, 3), world, metres, is inside of the object."""
+        """Return the chance (N,) that each of points (N, 3), world, is inside of the object."""
         return (self._distances(points) < 0.0).mean(axis=0)
 
     def contact_chance(self, points: Any, within: float = 0.002) -> FloatArray:
-        """The chance (N,) that the surface is within so many metres of points (N, 3), world."""
+        """Return the chance (N,) that the surface is near points (N, 3), world; within: metres."""
         require_positive("within", within)
         return (np.abs(self._distances(points)) <= within).mean(axis=0)
 
     def collision_chance(self, hand: trimesh.Trimesh | HandShape, path: Any) -> Chances:
-        """The chance that a closed hand meets the object on its path; arrays of one number.
+        """Return the chance that a closed hand meets the object on its path; arrays of one number.
 
         path (P, 4, 4): poses world_from_hand at which it is tested.
         """
@@ -257,7 +257,7 @@ class PoseBelief:
     def grasp_chance(
         self, world_from_gripper: Any, width: Any, gripper: Gripper | None = None
     ) -> Chances:
-        """The chances (G,) that grasps work, as far as geometry says.
+        """Return the chances (G,) that grasps work, as far as geometry says.
 
         world_from_gripper (G, 4, 4), width (G,): between the fingers, metres; one number for all.
         A grasp works where the fingers are free, something of the object is between their pads, and
@@ -271,7 +271,7 @@ class PoseBelief:
     def best_grasp(
         self, object_from_gripper: Any, width: Any, gripper: Gripper | None = None
     ) -> tuple[FloatArray, float]:
-        """The pose world_from_gripper (4, 4) that works with the largest chance, and this chance.
+        """Return the pose world_from_gripper (4, 4) of the largest chance to work, and this chance.
 
         object_from_gripper (G, 4, 4), width (G,): grasps of the object, as planned on its mesh.
         They are tried where some members have the object, the best and the modes' among them.
@@ -290,15 +290,15 @@ class PoseBelief:
         return world[int(np.argmax(chance))], float(chance.max())
 
     def _distances(self, points: Any) -> FloatArray:
-        """Signed distances (K, N) of world points from every member's surface."""
+        """Return signed distances (K, N) of world points from every member's surface."""
         return signed_distances(self._sdf, self._poses, frozen("points", points, (None, 3)))
 
     def _chances(self, works: np.ndarray) -> Chances:
-        """Shares of members (K, G) for which something holds."""
+        """Return shares of members (K, G) for which something holds."""
         return wilson(works.mean(axis=0), len(works))
 
     def _repr_png_(self) -> bytes:
-        """The outlines of all members from above and from the side, for notebooks."""
+        """Return the outlines of all members from above and from the side, for notebooks."""
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(8.0, 4.0), layout="constrained")
@@ -322,7 +322,7 @@ class PoseBelief:
 def grasps_work(
     sdf: SdfGrid, poses: Poses, world_from_gripper: Any, width: Any, gripper: Gripper
 ) -> np.ndarray:
-    """Whether each grasp (G,) works on the object at each of poses: flags (K, G).
+    """Return whether each grasp (G,) works on the object at each of poses: flags (K, G).
 
     world_from_gripper, width: as `PoseBelief.grasp_chance` takes them.
     """
@@ -347,7 +347,7 @@ def grasps_work(
 
 
 def pose_offsets(symmetry: ObjectSymmetry, own: FloatArray, others: FloatArray) -> FloatArray:
-    """How other poses (M, 4, 4), object_from_world, are off from one (4, 4): vectors (M, 6).
+    """Return how poses (M, 4, 4), object_from_world, are off one (4, 4): vectors (M, 6).
 
     Of the object's centre (metres) and the rotation vector (radians), both in world axes, after
     the symmetry of the object that brings each of the others nearest.
@@ -360,7 +360,7 @@ def pose_offsets(symmetry: ObjectSymmetry, own: FloatArray, others: FloatArray) 
 
 
 def wilson(share: Any, count: int) -> Chances:
-    """Shares (G,) of so many trials, with Wilson's 90 % interval."""
+    """Return shares (G,) of so many trials, with Wilson's 90 % interval."""
     share, square = np.asarray(share, dtype=np.float64), _NORMAL**2 / count
     middle = (share + 0.5 * square) / (1.0 + square)
     half = _NORMAL * np.sqrt(share * (1.0 - share) / count + 0.25 * square / count) / (1.0 + square)
@@ -368,7 +368,7 @@ def wilson(share: Any, count: int) -> Chances:
 
 
 def _nodes(gripper: Gripper) -> tuple[FloatArray, FloatArray]:
-    """Points of both fingers, from the opening outwards, and between the pads at width 1."""
+    """Return points of both fingers, from the opening outwards, and between the pads at width 1."""
     across = 0.5 * gripper.width * np.linspace(-1.0, 1.0, 3)
     outwards = gripper.thickness * np.array([1e-6, 1.0])  # the inner and the outer side
     back, pad = -gripper.length * np.linspace(0.0, 1.0, 4), -gripper.pad * np.linspace(0, 1, 2)
@@ -381,7 +381,7 @@ def _nodes(gripper: Gripper) -> tuple[FloatArray, FloatArray]:
 
 
 def _nearest_alike(symmetry: ObjectSymmetry, own: FloatArray, others: FloatArray) -> FloatArray:
-    """Rotations (M, 3, 3) that look as others do, each as near to `own` (3, 3) as one can be."""
+    """Return rotations (M, 3, 3) that look as others do, as near to `own` (3, 3) as possible."""
     if symmetry.sphere:
         return np.broadcast_to(own, others.shape)
     alike = product(others[:, None], symmetry.rotations)  # (M, S, 3, 3)
@@ -399,7 +399,7 @@ def _nearest_alike(symmetry: ObjectSymmetry, own: FloatArray, others: FloatArray
 
 
 def _rotation_vectors(turns: FloatArray) -> FloatArray:
-    """Axes times angles (M, 3), radians, of rotations (M, 3, 3)."""
+    """Return axes times angles (M, 3), radians, of rotations (M, 3, 3)."""
     double = twice_sine_axis(turns)
     size = np.sqrt((double**2).sum(axis=1, keepdims=True))
     return double * rotation_angle(turns)[:, None] / np.maximum(size, 1e-300)

@@ -1,4 +1,4 @@
-"""What happens in a session: the values that a session announces to recorders.
+"""The events of a session, which it announces to recorders.
 
 `replay.mcap.schemas` says how the message on an event's topic is stored, and what it accepts.
 """
@@ -24,6 +24,15 @@ if TYPE_CHECKING:
 _LEAST_SIDEWAYS = 0.2  # horizontal part of the direction of a push that moves the object
 
 
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """When the steps of a session register by themselves."""
+
+    contacts: int = 0  # at least so many are known
+    step: int = 0  # not before this one
+    steps: tuple[int, ...] | None = None  # of no others than these; None: of all
+
+
 @dataclass(frozen=True, eq=False)
 class SessionStarted:
     """Opens every recording."""
@@ -47,6 +56,10 @@ class SessionStarted:
     environment: Mapping[str, str] = field(default_factory=dict)
     # Digest of the recording whose problems these are, "" if the session made its own.
     source: str = ""
+    # None where a program asks for each registration, and in recordings of earlier versions.
+    start: Start | None = None
+    # Metres that a touch moves the object at most; None in recordings of earlier versions.
+    moves: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +156,7 @@ class SnapshotTaken:
 
 @dataclass(frozen=True)
 class Traced:
-    """Where a stage of a registration stands at its start or after a block of iterations."""
+    """State of a stage of a registration at its start or after a block of iterations."""
 
     topic: ClassVar[str] = "/trace"
 
@@ -187,7 +200,7 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class Decided:
-    """Which probe a steered session takes next, or why none; it follows the results of its step."""
+    """The probe that a policy takes next, or why none; it follows the results of its step."""
 
     topic: ClassVar[str] = "/decision"
 
@@ -200,7 +213,7 @@ class Decided:
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """What a program was told of a result, mode by mode; see `chsel.PoseBelief`."""
+    """The belief after a result, mode by mode; see `chsel.PoseBelief`."""
 
     topic: ClassVar[str] = "/belief"
 

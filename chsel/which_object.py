@@ -17,7 +17,7 @@ from chsel.problem.noise import LIMIT, noise_model
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.trust import SENSOR_NOISE, pose_energies
-from chsel.session import NextProbe, Session
+from chsel.session.session import NextProbe, Session
 
 if TYPE_CHECKING:
     import trimesh
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """How well one of the objects fits."""
+    """One of the objects, and how well it fits."""
 
     name: str
     energy: float  # nats, of its best hypothesis: the lowest is the likeliest object
@@ -72,15 +72,15 @@ class WhichObject:
             self._open = opened.pop_all()
         smallest = min(session.started.sdf.diameter for session in self.sessions.values())
         for session in self.sessions.values():
-            session.count_places_for(smallest)
+            session.intake.diameter = smallest
 
     def add(self, **what: Any) -> None:
         """Add what became known to all, or to none, see `Session.add`."""
         sessions = self.sessions.values()
         with self._lock, ExitStack() as taken:
-            accepted = [session.accepted(**what) for session in sessions]
-            for session, one in zip(sessions, accepted, strict=True):
-                taken.callback(session.take, one)  # all of them, whatever one raises
+            prepared = [session.prepare(**what) for session in sessions]
+            for session, one in zip(sessions, prepared, strict=True):
+                taken.callback(session.commit, one)  # all of them, whatever one raises
 
     def register(self) -> list[Candidate]:
         """Register every object; the likeliest first.
@@ -104,7 +104,7 @@ class WhichObject:
         return self.candidates
 
     def next_probe(self, actions: Actions | None = None) -> NextProbe | None:
-        """Where to touch next, by the likeliest object, see `Session.next_probe`."""
+        """Return where to touch next, by the likeliest object, see `Session.next_probe`."""
         if not self.candidates:
             raise SettingError("nothing is registered; accepted: `register` before `next_probe`")
         session = self.sessions[self.candidates[0].name]

@@ -31,7 +31,7 @@ robot = FakeRobot(mesh, TRUTH)
 depth = rendered(robot.scene)
 with chsel.Session(mesh) as session:
     session.add(depth=depth, mask=depth > 0.0, camera=CAMERA, world_from_camera=EYE)
-    print(f"one look, {len(session.online.points.contacts)} points: {session.register().trust}")
+    print(f"one look, {len(session.points.contacts)} points: {session.register().trust}")
     for start in (ABOVE, BEHIND):
         path, contact = robot.touch(start, 0.3)
         session.add(hand=FINGER, path=path, contact=contact)

@@ -22,9 +22,8 @@ from chsel.methods.method import Method
 from chsel.numerics.compiler import watched
 from chsel.numerics.threads import set_threads
 from chsel.problem.settings import build_settings
-from chsel.registration import symmetry_for_errors
-from chsel.rehearsal import warm_up, warm_up_policy, warm_up_sensing
-from chsel.session import Session
+from chsel.session.rehearsal import warm_up, warm_up_policy, warm_up_sensing
+from chsel.session.run import Run
 from replay.console import Console
 from replay.files import WritingError, file_digest
 from replay.recorder import open_recorder
@@ -60,15 +59,24 @@ def main(config: DictConfig) -> None:
         stack.callback(scene.session.close)
         with compiling_line():
             warm_up(method)
-            if scene.steering is not None:
-                warm_up_policy(scene.steering.policy)
+            if scene.policy is not None:
+                warm_up_policy(scene.policy)
             if kind == "sensors":
                 warm_up_sensing()
         folder = make_run_folder(Path(checked.logs) / "probe", scene.object_name, method_name)
         write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
         started = session_started(checked, values, method_name, scene)
         with Interrupt() as interrupt:
-            interrupted = run(folder, checked, method, scene, started, grasps, interrupt, display)
+            interrupted = run_session(
+                folder,
+                checked,
+                method=method,
+                scene=scene,
+                started=started,
+                grasps=grasps,
+                interrupt=interrupt,
+                display=display,
+            )
     if interrupted:
         sys.exit(130)
 
@@ -99,7 +107,7 @@ def _require_used_settings(config: ProbeConfig) -> None:
 
 
 def _default_because() -> str:
-    """The choice that `anchored` is the default for, if it was taken as such; else ""."""
+    """Return the choice for which `anchored` was taken as the default; else ""."""
     chosen = HydraConfig.get()
     choices = chosen.runtime.choices
     if choices["method"] == "chsel" or any(w.startswith("method=") for w in chosen.overrides.task):
@@ -131,9 +139,10 @@ class Interrupt:
         self._asked = True
 
 
-def run(
+def run_session(
     folder: Path,
     config: ProbeConfig,
+    *,
     method: Method,
     scene: Scene,
     started: SessionStarted,
@@ -141,42 +150,38 @@ def run(
     interrupt: Interrupt,
     display: Display,
 ) -> bool:
-    """Run the session to its end or to Ctrl-C; whether it was interrupted."""
+    """Run the session to its end or to Ctrl-C; return whether it was interrupted."""
     if started.session == "recorded":
         display.say(f"object: {started.object}")
-    steering = scene.steering
-    display.probes(scene.session.count if steering is None else steering.policy.settings.probes)
+    policy = scene.policy
+    display.probes(scene.session.count if policy is None else policy.settings.probes)
     settings = config.recording
-    session = Session.begun(
-        started,
+    run = Run(
         method,
         open_recorder(
             folder / "recording.mcap" if settings.mcap else None,
             folder / "recording.rrd" if settings.rerun else None,
             live=settings.live,
         ),
-        online=scene.online(method.online, config.seed),
-        symmetry=symmetry_for_errors(started),
-        steering=steering,
+        policy=policy,
+        with_belief=True,
         opening=scene.warnings,
         snapshot_interval=settings.snapshot_interval,
         show=lambda *_: interrupt.check(),
     )
+    scene.begin(run, started)
     display.warn(scene.warnings)
     rows: list[Row] = []
     outcome = "finished"
     try:
         try:
-            walked = steps(
-                session, scene.session, timings=settings.timings, belief=True, grasps=grasps
-            )
-            for row in walked:
+            for row in steps(run, scene.session, timings=settings.timings, grasps=grasps):
                 rows.append(row)
                 display.probe(row)
-                display.warn(session.warnings)
+                display.warn(run.warnings)
                 interrupt.check()
-            session.check_moved()
-            display.warn(session.warnings)
+            run.check_moved()
+            display.warn(run.warnings)
         except KeyboardInterrupt:
             outcome = "interrupted"
         except SystemExit:  # the reader of the output has closed it
@@ -187,38 +192,40 @@ def run(
             raise
         finally:
             with _first_error_alone(outcome):
-                session.close(outcome)
+                run.end(outcome)
     except RecordingError as error:
         outcome = f"failed: {error}"
         raise
     finally:
         with _first_error_alone(outcome):
-            _summarise(folder, scene, session, rows, outcome)
+            _summarise(folder, scene, run=run, rows=rows, outcome=outcome)
     if scene.report is not None:
         display.sensed(scene.report)
     display.table(rows)
     if outcome == "interrupted":
         display.say("interrupted: the recording holds everything up to here")
-    if session.stop == "grasp":
-        display.grasped(session)
-    elif steering is not None:
-        display.stopped(steering)
+    if run.stop == "grasp":
+        display.grasped(run)
+    elif run.loop.state.decided is not None:
+        display.stopped(run.loop.state.decided)
     display.written(folder)
     display.pose(rows)
-    display.verdict(session.trust)
+    display.verdict(run.trust)
     return outcome == "interrupted"
 
 
 def _first_error_alone(outcome: str) -> suppress | nullcontext[None]:
-    """Where a run has failed or was interrupted, what cannot be written then is not reported."""
+    """Suppress errors of writing where a run has failed or was interrupted."""
     if outcome == "finished":
         return nullcontext()
     return suppress(OSError, RecordingError, WritingError)
 
 
-def _summarise(folder: Path, scene: Scene, session: Session, rows: list[Row], outcome: str) -> None:
+def _summarise(folder: Path, scene: Scene, *, run: Run, rows: list[Row], outcome: str) -> None:
     """Write the outcome, warnings, and the numbers of every step, times included."""
-    started, trust, recording = session.started, session.trust, folder / "recording.mcap"
+    started = run.started
+    trust = run.trust
+    recording = folder / "recording.mcap"
     sensors = scene.report.total().items() if scene.report else ()
     names = ("runner", "object", "session", "method", "seed")
     summary = {
@@ -226,7 +233,7 @@ def _summarise(folder: Path, scene: Scene, session: Session, rows: list[Row], ou
         "outcome": outcome,
         "recording_digest": file_digest(recording) if recording.is_file() else None,
         "trust": None if trust is None else asdict(trust),  # of the last result
-        "warnings": [asdict(warning) for warning in session.warnings],
+        "warnings": [asdict(warning) for warning in run.warnings],
         "sensors": {name: asdict(counts) for name, counts in sensors},
         "steps": rows,
         "environment": dict(started.environment),

@@ -15,7 +15,7 @@ import trimesh
 from omegaconf import DictConfig
 
 from chsel.errors import PoseError, SettingError
-from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.poses import Poses, inverse, nearest_rigid
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.settings import build_settings, in_preset
@@ -179,11 +179,16 @@ class PackageSession:
                 about[name][str(step)] = answer[name]
             return found
 
-        online = session.online(HOW, repeat_seed(self.trial.seed, self.draw), only=self.steps)
-        for step in online.steps(session.perceived(), register, (RefusedError, PoseError)):
-            if step.failure is not None:
-                about["failed"][str(step.step)] = " ".join(str(step.failure).split())
-            yield step.step
+        seed = repeat_seed(self.trial.seed, self.draw)
+        loop = session.loop(HOW, seed=seed, steps=self.steps)
+        for probe in session.probes():
+            loop.perceive(probe)
+            if loop.enough:
+                try:
+                    loop.remember(register(loop.problem()))
+                except (RefusedError, PoseError) as error:
+                    about["failed"][str(probe.step)] = " ".join(str(error).split())
+            yield probe.step
         with whole_file(self.sets) as beside, beside.open("wb") as file:
             np.savez(file, **arrays)
         with whole_file(self.about) as beside:

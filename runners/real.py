@@ -23,13 +23,13 @@ from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.threads import require_threads, threads
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import object_symmetry
-from chsel.problem.online_registration import OnlineRegistration
+from chsel.problem.initial_sets import posed_problem
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import CheckedSettings, build_settings
 from chsel.problem.streams import Purpose, StreamKey, uniforms
-from chsel.rehearsal import warm_up
+from chsel.session.rehearsal import warm_up
 from replay.console import Console, Progress
 from replay.environment import environment
 from replay.files import whole_file
@@ -167,9 +167,15 @@ class RealCase:
         """What comes of registering these of the touches; lengths in metres, angles in radians."""
         given = self._given
         points = KnownPoints(free=given.points.free, known=self._touches[kept])
-        place = (given.sdf, given.workspace, given.free_resolution)
-        online = OnlineRegistration(*place, method.online, seed=seed, points=points)
-        problem, begun = online.pose(0), time.perf_counter()
+        problem = posed_problem(
+            given.sdf,
+            points,
+            workspace=given.workspace,
+            free_resolution=given.free_resolution,
+            key=StreamKey(seed, 0),
+            settings=method.online,
+        )
+        begun = time.perf_counter()
         found = method.register(problem)
         seconds = time.perf_counter() - begun
         best = found.object_from_world[:1]

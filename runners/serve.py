@@ -16,7 +16,7 @@ from chsel.methods import build_method, default_method
 from chsel.numerics.threads import set_threads
 from chsel.policies import build_policy
 from chsel.problem.settings import build_settings
-from chsel.rehearsal import warm_up, warm_up_policy, warm_up_sensing
+from chsel.session.rehearsal import warm_up, warm_up_policy, warm_up_sensing
 from replay.console import Console
 from runners.command.program import command, plain
 from runners.run.display import compiling_line

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
-from chsel.errors import require_choice
+from chsel.errors import require_choice, require_instance
 from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
-from chsel.methods.anchored.pose_bound import pose_bound
 from chsel.methods.chsel import Chsel, ChselSettings
 from chsel.methods.cvo import Cvo, CvoSettings
 from chsel.methods.gradient_descent import GradientDescent, GradientDescentSettings
@@ -20,19 +20,8 @@ from chsel.methods.medial_constraint import (
 )
 from chsel.methods.method import Method
 from chsel.methods.svgd import Svgd, SvgdSettings
-from chsel.problem.online_registration import OnlineSettings
-from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
-from chsel.problem.settings import PRESETS, Entry, NamedChoices
-from chsel.problem.trust import (
-    DETERMINED,
-    MANY_CONTACTS,
-    SENSOR_NOISE,
-    WIDE,
-    explaining,
-    fits_elsewhere,
-    has_pose,
-    trust_in,
-)
+from chsel.problem.initial_sets import OnlineSettings
+from chsel.problem.settings import PRESETS, Entry, NamedChoices, changed_settings
 
 _OURS: dict[str, Entry[Method]] = {
     "chsel": (Chsel, ChselSettings()),
@@ -72,37 +61,15 @@ def default_method(preset: str = "default") -> str:
     return "anchored" if preset == "default" else "chsel"
 
 
-def noise_of(method: Method) -> float:
-    """The noise of known points by a method's settings, metres; SENSOR_NOISE if it has none."""
-    settings = getattr(method, "settings", None)
-    return settings.noise if isinstance(settings, AnchoredSettings) else SENSOR_NOISE
-
-
-def trust_by(method: Method, problem: RegistrationProblem, hypotheses: Hypotheses) -> Trust | None:
-    """How far to trust what a method found, by the noise in its settings; None without a pose.
-
-    A single mode has to stand beside what a search for other poses finds, among them turns under
-    which the object looks nearly alike, and poses that leave out one of few contacts. Of many
-    contacts, `anchored` has done this search itself. Where pushes may have moved the object, also
-    beside what is found for other distances of them. How far the pose may be off is in
-    `centre_within` and `turn_within`, by `pose_bound`.
-    """
-    if not has_pose(hypotheses):
-        return None
-    noise, pushes, posed = noise_of(method), problem.pushes, problem
-    problem = posed.carried(hypotheses.push_distance)
-    trust, rivals = trust_in(problem, hypotheses, noise), None
-    searched = isinstance(method, Anchored) and len(problem.points.known) >= MANY_CONTACTS
-    if trust.verdict == DETERMINED and not searched:
-        rivals = Anchored(AnchoredSettings(noise=noise)).minima(problem)
-        trust = trust_in(problem, hypotheses, noise, rivals)
-    if trust.verdict == DETERMINED and pushes is not None:
-        search = Anchored(AnchoredSettings(noise=noise))
-        others = [posed.carried(distance) for distance in pushes.distances]
-        found = ((other, search.minima(other)) for other in others)
-        if any(fits_elsewhere(problem, hypotheses, *one, noise) for one in found):
-            reason = "pushes of another length fit elsewhere"
-            trust = replace(trust, verdict=WIDE, modes=0, reason=reason)
-    poses, _ = explaining(problem, hypotheses, noise, rivals)
-    centre, turn = pose_bound(problem.sdf, poses)
-    return replace(trust, centre_within=centre, turn_within=turn)
+def method_settings(method: str, preset: str, *changes: Any) -> Any:
+    """Return the preset's settings with changes over them: mappings, or whole settings."""
+    chosen = preset_settings(method, preset)
+    for change in changes:
+        if dataclasses.is_dataclass(change) and not isinstance(change, type):
+            chosen = change
+        elif change is not None:
+            require_instance(
+                "settings", change, Mapping, "a mapping, or the settings of the method"
+            )
+            chosen = changed_settings(chosen, change, f"method={method}: settings")
+    return chosen

@@ -14,7 +14,7 @@ from chsel.methods.anchor_sampling import AnchoredStarts, anchored_starts
 from chsel.methods.gradient_descent import DescentSettings, descend
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import BoolArray, FloatArray
-from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.search_space import PlaneSettings, search_space

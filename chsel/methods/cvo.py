@@ -21,7 +21,7 @@ from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp, exps, sine_cosine
 from chsel.numerics.pose_tuples import Triple, composed, moved, pose_at, turned_back
 from chsel.numerics.threads import parallel_for
-from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.sdf_grid import COARSEST, FINEST, SdfGrid

@@ -15,7 +15,7 @@ from chsel.cost.objective import Objective
 from chsel.errors import SettingError, require_at_most
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.search_space import PlaneSettings, search_space

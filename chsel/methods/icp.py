@@ -14,7 +14,7 @@ from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.eigen import decompose
 from chsel.numerics.pose_tuples import finite, moved, pose_at, turned
 from chsel.numerics.threads import parallel_for
-from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive

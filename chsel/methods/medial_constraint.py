@@ -20,7 +20,7 @@ from chsel.numerics.compiler import compiled, implements, inner, spliced
 from chsel.numerics.elementary import logs
 from chsel.numerics.pose_tuples import all_finite, decode, finite, pose_at
 from chsel.numerics.threads import parallel_for, require_ieee_arithmetic
-from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.points import VoxelGrid, Workspace
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Generic, Protocol, TypeVar
 
 from chsel.numerics.threads import require_ieee_arithmetic
-from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.registration_problem import (
     Hypotheses,
     NullObserver,

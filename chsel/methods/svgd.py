@@ -18,7 +18,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.elementary import exp, log
 from chsel.numerics.pose_tuples import decode, pull_back
-from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.search_space import PlaneSettings, search_space

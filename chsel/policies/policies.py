@@ -24,7 +24,7 @@ def grid(problem: DecisionProblem, forecast: Forecast) -> FloatArray:
 
 
 def random(problem: DecisionProblem, forecast: Forecast) -> FloatArray:
-    """Numbers (A,), uniform in [0, 1), from the problem's own stream."""
+    """Return numbers (A,), uniform in [0, 1), from the problem's stream."""
     return uniforms(problem.key.stream(Purpose.POLICY), 0.0, 1.0, len(problem.actions))
 
 
@@ -68,13 +68,13 @@ def expected_loss(problem: DecisionProblem, forecast: Forecast) -> FloatArray:
 
 
 def _rated_by(score: Callable[..., FloatArray], *, is_gain: bool = True) -> Entry[Policy]:
-    """The class of policies that rate actions by a score, and the settings of all policies."""
+    """Return the class of policies that rate actions by a score, with the shared settings."""
     names = {"settings_class": PolicySettings, "rate": staticmethod(score), "is_gain": is_gain}
     return type(score.__name__, (ConfiguredPolicy,), names), PolicySettings()
 
 
 def _lacks(policy: Any) -> str | None:
-    """What an object with settings lacks to be a policy, and what is accepted."""
+    """Return why an object is not a policy, and what is accepted; None if it is one."""
     if not isinstance(policy.settings, PolicySettings):
         return "settings of another class; accepted: one derived from PolicySettings"
     if not callable(getattr(policy, "decide", None)):

@@ -58,7 +58,7 @@ class StopSettings(CheckedSettings):
 
 @dataclass(frozen=True)
 class PolicySettings(CheckedSettings):
-    """What all policies share."""
+    """Settings of every policy."""
 
     probes: Annotated[int, positive, at_most(MOST_PROBES)] = 30  # the budget of a session
     # Standard deviation of a contact's place from where a pose of the belief has it, metres.
@@ -88,11 +88,11 @@ class ConfiguredPolicy(Generic[Settings]):
         self.settings = settings or self.settings_class()
 
     def rate(self, problem: DecisionProblem, forecast: Forecast) -> FloatArray:
-        """A rating (A,) of all actions of a problem: the higher the better."""
+        """Return a rating (A,) of all actions of a problem: the higher the better."""
         raise NotImplementedError
 
     def decide(self, problem: DecisionProblem) -> Decision:
-        """The available action of the highest rating, the first of several, or why to stop."""
+        """Return the available action of the highest rating, the first of several, or a stop."""
         forecast = Forecast(problem, self.settings.noise)
         rating = self.rate(problem, forecast)
         if self.is_gain and problem.actions.seconds is not None:
@@ -109,7 +109,7 @@ class ConfiguredPolicy(Generic[Settings]):
         return Decision(chosen, stop, forecast.spread, score, *chances, contacts)
 
     def _stop(self, problem: DecisionProblem, forecast: Forecast, feasible: BoolArray) -> str:
-        """Why no probe is made, "" if one is."""
+        """Return why no probe is made, "" if one is."""
         stop, diameter = self.settings.stop, problem.sdf.diameter
         if problem.key.step >= self.settings.probes:
             return "budget"

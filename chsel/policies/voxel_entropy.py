@@ -31,7 +31,7 @@ _WIDEST = 250  # cells that a hand is widened by, at most
 
 @dataclass(frozen=True)
 class VoxelEntropySettings(PolicySettings):
-    """All settings of the policy."""
+    """Settings of the policy."""
 
     # Side of a voxel, metres; larger where the workspace would have more than a million.
     voxel: Annotated[float, positive] = 0.02
@@ -108,7 +108,7 @@ def occupancy_entropy(problem: DecisionProblem, box: VoxelBox) -> FloatArray:
 
 
 def filled_points(sdf: SdfGrid, side: float) -> FloatArray:
-    """Points (N, 3) of an object in its frame: on its surface, and inside, half a side apart."""
+    """Return points (N, 3) on an object and in it, in its frame, half a side apart."""
     stride = max(int(0.5 * side / sdf.resolution), 1)
     inside = np.argwhere(sdf.values[::stride, ::stride, ::stride] <= 0.0) * stride
     inside = inside[evenly_spaced(len(inside), _MOST_POINTS)]
@@ -116,7 +116,7 @@ def filled_points(sdf: SdfGrid, side: float) -> FloatArray:
 
 
 def _widened(front: HandFront, side: float) -> HandFront:
-    """The front of a hand that sweeps every voxel of which it touches the square ahead of it."""
+    """Return the front of a hand that sweeps every voxel of which it touches the square ahead."""
     margin = min(int(0.5 * side / front.cell), _WIDEST)
     heights = np.pad(front.heights, margin, constant_values=-np.inf)
     heights = maximum_filter(heights, 2 * margin + 1, mode="constant", cval=-np.inf)

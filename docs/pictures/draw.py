@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scipy.ndimage import binary_closing, binary_fill_holes, gaussian_filter
 
-from chsel.methods import trust_by
 from chsel.methods.anchor_sampling import AnchorSampler, most_informative_first
 from chsel.methods.anchored.anchored import EFFORTS, Anchored, AnchoredSettings, Search
 from chsel.numerics.arrays import FloatArray
@@ -32,6 +31,7 @@ from chsel.problem.search_space import search_space
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
 from chsel.problem.surface import signed_distances
+from chsel.session.judging import trust_by
 from replay.comparing.choices import recorded_method
 from replay.mcap.reader import read_recording
 from replay.rerun.scene import coarsened, deepest

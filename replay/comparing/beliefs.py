@@ -1,19 +1,19 @@
-"""What recorded results mean, computed from the results themselves."""
+"""Beliefs of recorded results, computed from the results themselves."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from chsel.belief import PoseBelief
-from chsel.methods import noise_of, trust_by
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.session.judging import noise_of, trust_by
 from replay.comparing.choices import recorded_method
 from replay.mcap.reader import Recording
 
 
-class Beliefs:
-    """Beliefs of results of one session, in their order; modes keep their numbers."""
+class BeliefSequence:
+    """Beliefs after the results of one session, in their order; modes keep their numbers."""
 
     def __init__(self, recording: Recording) -> None:
         """Raises RecordingError if the recording does not have the settings of its method."""
@@ -21,7 +21,7 @@ class Beliefs:
         self._last: PoseBelief | None = None
 
     def after(self, problem: RegistrationProblem, found: Hypotheses) -> PoseBelief | None:
-        """What is believed after one more result; None for one without a pose."""
+        """Return the belief after one more result; None for one without a pose."""
         trust = trust_by(self._method, problem, found)
         if trust is None:
             return None

@@ -26,10 +26,10 @@ from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.settings import PRESETS, in_preset
 from chsel.problem.streams import StreamKey
-from chsel.registration import Registered, register_recorded, symmetry_for_errors
-from chsel.rehearsal import warm_up
-from replay.comparing.again import snapshot_interval
+from chsel.session.recording import Registered, register_recorded, symmetry_for_errors
+from chsel.session.rehearsal import warm_up
 from replay.comparing.choices import Choice, is_recorded, recorded_method
+from replay.comparing.recomputation import snapshot_interval
 from replay.environment import environment
 from replay.files import file_digest, new_file
 from replay.mcap.reader import Recording
@@ -248,9 +248,9 @@ def _register(
     return register_recorded(
         posed,
         method,
-        recorder,
-        recording.start_at(posed.step).world_from_object,
-        symmetry_for_errors(start),
+        recorder=recorder,
+        world_from_object=recording.start_at(posed.step).world_from_object,
+        symmetry=symmetry_for_errors(start),
         snapshot_interval=snapshot_interval(recording.snapshots(posed.step)),
     )
 

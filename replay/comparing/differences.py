@@ -176,6 +176,8 @@ def result_differences(recorded: Sequence[Event], other: Sequence[Event]) -> Res
         else:
             ulps = max(item.ulps or 0 for item in differing)
             found.add(stage, [item.text for item in differing], ulps=ulps)
+    if not recorded and others:
+        found.add("a registration, which is not recorded")
     if MEASURED in others and not any(isinstance(event, Measured) for event in recorded):
         found.add(f"{MEASURED}, which are not recorded")
     return found
@@ -215,8 +217,12 @@ def _stages(event: Event) -> dict[str, Content]:
     values = content(event)
     match event:
         case ProblemPosed():
-            sets = {"E_0": values["initial_set"], "E_l": values["low_cost_set"]}
-            return {f"making {name}": {name: poses} for name, poses in sets.items()}
+            pushes = {name: values[name] for name in values if name.startswith("pushes")}
+            return {
+                "making E_0": {"E_0": values["initial_set"]},
+                "making E_l": {"E_l": values["low_cost_set"]},
+                "pushes": pushes,
+            }
         case Traced():
             return {f"{event.stage}, iteration {event.iteration}": values}
         case SnapshotTaken():

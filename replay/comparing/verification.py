@@ -1,4 +1,4 @@
-"""Whether today's code gives the recorded bits, and if not, where it first does not."""
+"""Whether the code as it stands gives the recorded bits, and if not, where it first differs."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pathlib import Path
 
 from chsel.errors import ChselError, RecordingError
 from chsel.numerics.threads import threads
-from replay.comparing.again import Again, made_again, result_in
 from replay.comparing.differences import result_differences
+from replay.comparing.recomputation import Recomputed, recomputed, result_in
 from replay.environment import environment_differences
 from replay.mcap.reader import Recording, read_recording
 
@@ -22,11 +22,11 @@ EQUAL, DIFFERS, NO_RESULT = "equal", "differs", "no result"
 
 @dataclass(frozen=True)
 class Verdict:
-    """What comparing a recorded registration or decision with today's showed."""
+    """How a recorded registration or decision compares with the one computed now."""
 
-    step: int
+    step: int  # of the registration, or that the decision follows
     name: str  # of the method or policy
-    is_decision: bool  # that follows the step, else its registration
+    is_decision: bool  # else a registration
     outcome: str  # "equal", "differs", or "no result" where the recorded registration did not end
     stage: str = ""  # the first that differs
     before: int = 0  # how many recorded stages before it are equal
@@ -35,32 +35,33 @@ class Verdict:
     environment: tuple[str, ...] = ()  # what of it is not as recorded
 
     @classmethod
-    def of(cls, again: Again, environment: tuple[str, ...]) -> Verdict:
-        """The verdict on what was made again."""
-        about = cls(again.step, again.name, again.is_decision, EQUAL)
-        if not again.is_decision and result_in(again.recorded) is None:
+    def of(cls, found: Recomputed, environment: tuple[str, ...]) -> Verdict:
+        """Return the verdict on what was recomputed."""
+        about = cls(found.step, found.name, found.is_decision, EQUAL)
+        has_no_result = not found.is_decision and result_in(found.recorded) is None
+        if found.recorded and has_no_result:
             return replace(about, outcome=NO_RESULT)
-        found = result_differences(again.recorded, again.today)
-        if not found.stage:
-            return replace(about, before=found.before)
-        ended = [f"today it ends: {again.failure}"] if again.failure else []
+        compared = result_differences(found.recorded, found.computed)
+        if not compared.stage:
+            return replace(about, before=compared.before)
+        ended = [f"now it ends: {found.failure}"] if found.failure else []
         return replace(
             about,
             outcome=DIFFERS,
-            stage=found.stage,
-            before=found.before,
-            differences=(*found.lines, *ended),
-            largest_ulps=found.largest_ulps,
+            stage=compared.stage,
+            before=compared.before,
+            differences=(*compared.lines, *ended),
+            largest_ulps=compared.largest_ulps,
             environment=environment,
         )
 
     @property
     def label(self) -> str:
-        """What it is about: "step 3, chsel", or "decision after step 3, information"."""
+        """Subject of the verdict: "step 3, chsel", or "decision after step 3, information"."""
         return f"{'decision after ' * self.is_decision}step {self.step}, {self.name}"
 
     def report(self) -> str:
-        """The verdict for people; several lines if it is "differs"."""
+        """Return the verdict for people; several lines if it is "differs"."""
         if self.outcome != DIFFERS:
             return f"{self.label}: {self.outcome}"
         stages = "values" if self.is_decision else "stages"
@@ -75,7 +76,7 @@ class Verdict:
 
 
 def verify(recording: Recording, steps: Sequence[int] | None = None) -> Iterator[Verdict]:
-    """Verdicts on steps of a recording, in their order: on registrations and decisions.
+    """Yield verdicts on steps of a recording, in their order: on registrations and decisions.
 
     steps: None for all that pose a problem or are followed by a decision. The belief of a decision
     is compared where the registration before it is run again. Raises RecordingError if the
@@ -84,17 +85,17 @@ def verify(recording: Recording, steps: Sequence[int] | None = None) -> Iterator
     decided = set(recording.decision_steps)
     recording.checked_steps([step for step in steps or () if step not in decided])
     environment = environment_differences(recording.start)
-    for event in made_again(recording, steps):
-        if isinstance(event, Again):
+    for event in recomputed(recording, steps):
+        if isinstance(event, Recomputed):
             yield Verdict.of(event, environment)
 
 
 @dataclass
 class FileVerdict:
-    """What verifying one file showed."""
+    """The verdicts on one file."""
 
     path: Path
-    verdicts: list[Verdict] = field(default_factory=list)
+    verdicts: list[Verdict] = field(default_factory=list)  # in the order of the recording
     unusable: str = ""  # why the file could not be verified
     digest: str = ""  # of the file
     seconds: float = 0.0  # from reading the file to its last verdict
@@ -107,13 +108,13 @@ class FileVerdict:
         return int(any(verdict.outcome == DIFFERS for verdict in self.verdicts))
 
     def compared(self, *, decisions: bool) -> list[Verdict]:
-        """The verdicts on registrations with a result, or on decisions."""
-        own = [verdict for verdict in self.verdicts if verdict.is_decision == decisions]
-        return [verdict for verdict in own if verdict.outcome != NO_RESULT]
+        """Return the verdicts on registrations with a result, or on decisions."""
+        asked = [verdict for verdict in self.verdicts if verdict.is_decision == decisions]
+        return [verdict for verdict in asked if verdict.outcome != NO_RESULT]
 
 
 def recordings_in(paths: Sequence[str | Path]) -> list[Path]:
-    """The files named, and for each folder the recordings in it and below, by name."""
+    """Return the files named, and for each folder the recordings in it and below, by name."""
     found: list[Path] = []
     for path in map(Path, paths):
         inside = sorted(path.rglob("*.mcap")) if path.is_dir() else [path]
@@ -126,7 +127,7 @@ def recordings_in(paths: Sequence[str | Path]) -> list[Path]:
 def verified_files(
     paths: Sequence[Path], steps: Sequence[int] | None = None, *, jobs: int = 1
 ) -> Iterator[FileVerdict]:
-    """Verdicts on files, in their order, on as many processes as `jobs`; a thread in each."""
+    """Yield verdicts on files, in their order, on `jobs` processes of a thread each."""
     verified = partial(_verified, steps=steps)
     if jobs == 1:
         yield from map(verified, paths)

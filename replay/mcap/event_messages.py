@@ -24,6 +24,7 @@ from chsel.events import (
     SensorImage,
     SessionStarted,
     SnapshotTaken,
+    Start,
 )
 from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
 from chsel.numerics.arrays import digest
@@ -101,6 +102,8 @@ def _session_values(event: SessionStarted) -> dict[str, Any]:
         "workspace": event.workspace.bounds,
         "mesh_digest": mesh_digest(event.mesh),
         "sdf_digest": event.sdf.digest,
+        "start": _start_values(event.start),
+        "moves": None if event.moves is None else np.array([event.moves]),
     }
 
 
@@ -114,8 +117,26 @@ def session_from(
         "initial_points": points,
         "mesh": mesh,
         "sdf": sdf,
+        "start": _start_from(values["start"]),
+        "moves": None if values["moves"] is None else float(values["moves"][0]),
     }
     return SessionStarted(**shared_arguments(SessionStarted, values) | parts)
+
+
+def _start_values(start: Start | None) -> dict[str, Any] | None:
+    """Return the message `Start`."""
+    if start is None:
+        return None
+    steps = None if start.steps is None else np.array(start.steps, dtype=np.int64)
+    return {"contacts": start.contacts, "step": start.step, "steps": steps}
+
+
+def _start_from(values: Mapping[str, Any] | None) -> Start | None:
+    """Return when the steps of a session register, from a message `Start`."""
+    if values is None:
+        return None
+    steps = None if values["steps"] is None else tuple(values["steps"].tolist())
+    return Start(contacts=values["contacts"], step=values["step"], steps=steps)
 
 
 def config_from_json(text: str) -> dict[str, Any]:

@@ -65,6 +65,8 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
     "Array": {"dtype": "string", "shape": "uint64*", "data": "bytes"},
     "Number": {"name": "string", "value": "double"},
     "Text": {"name": "string", "value": "string"},
+    # When steps register; `steps`: of no others than these.
+    "Start": {"contacts": "uint32", "step": "sint32", "steps": "i8[S]?"},
     "Session": {
         "format_version": "uint32",
         "runner": ("string", check_name),
@@ -80,6 +82,8 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "mesh_digest": "string",
         "sdf_digest": "string",
         "source": ("string", check_name),
+        "start": "Start?",
+        "moves": ("f8[1]?", finite),  # metres
     },
     "Probe": {
         "step": "sint32",

@@ -1,4 +1,4 @@
-"""Record today's results as the expected ones, after showing what changes and asking."""
+"""Record the results of the code as it stands as the expected ones, after asking."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import Hypotheses
-from replay.comparing.again import Again, made_again, result_in
-from replay.comparing.beliefs import Beliefs
+from replay.comparing.beliefs import BeliefSequence
 from replay.comparing.comparison import PlausibleSets
+from replay.comparing.recomputation import Recomputed, recomputed, result_in
 from replay.comparing.verification import DIFFERS, Verdict, recordings_in
 from replay.console import Console, plain_table
 from replay.environment import environment, environment_differences
@@ -120,25 +120,26 @@ class ResultChange:
 
 
 def write_accepted(recording: Recording, path: Path) -> list[ResultChange]:
-    """Write the recording with today's results to a new file; how each result differs.
+    """Write the recording with computed results to a new file; return how each result differs.
 
-    Registrations follow from today's results; decisions are of the recorded probes, whatever they
-    choose. Raises RecordingError if the recording was recovered with losses, behind which E_0 and
-    E_l do not follow from what is left. A recorded belief is that of today's result, too.
+    Registrations follow from computed results; decisions are of the recorded probes, whatever they
+    choose, and the steps that register stay. A recorded belief becomes that of the computed result.
+    Raise RecordingError if the recording was recovered with losses, behind which E_0 and E_l do not
+    follow from what is left.
     """
     changes: list[ResultChange] = []
     seconds: dict[int, Timed] = {}
     differing, sets = environment_differences(recording.start), PlausibleSets(recording)
-    beliefs = Beliefs(recording)
+    beliefs = BeliefSequence(recording)
     with closing(McapRecorder(path)) as recorder:
-        for event in made_again(recording, anew=True):
-            if isinstance(event, Again):
-                posed = event.today[0] if event.today else None
+        for event in recomputed(recording, follow_computed=True):
+            if isinstance(event, Recomputed):
+                posed = event.computed[0] if event.computed else None
                 if event.result is not None and isinstance(posed, ProblemPosed):
                     registered = posed.problem, event.result
                 changes.append(_change(recording, event, sets, differing))
                 seconds[event.step] = Timed(event.step, event.seconds)
-                for inner in event.today or event.recorded:
+                for inner in event.computed or event.recorded:
                     recorder.record(inner)
                 recorder.flush()
                 continue
@@ -160,17 +161,16 @@ def write_accepted(recording: Recording, path: Path) -> list[ResultChange]:
 
 
 def _change(
-    recording: Recording, again: Again, sets: PlausibleSets, differing: tuple[str, ...]
+    recording: Recording, found: Recomputed, sets: PlausibleSets, differing: tuple[str, ...]
 ) -> ResultChange:
-    verdict = Verdict.of(again, differing)
-    recorded, new = result_in(again.recorded), again.result
+    verdict = Verdict.of(found, differing)
+    recorded = result_in(found.recorded)
+    new = found.result
     if recorded is None or new is None:
         return ResultChange(verdict, {}, {})
-    problem = recording.problem(again.step)
-    old, now = (
-        _measured(events) | sets.numbers(problem, found)
-        for events, found in ((again.recorded, recorded), (again.today, new))
-    )
+    problem = recording.problem(found.step)
+    old = _measured(found.recorded) | sets.numbers(problem, recorded)
+    now = _measured(found.computed) | sets.numbers(problem, new)
     symmetry = object_symmetry(recording.start.mesh)
     return ResultChange(verdict, old, now, best_pose_moves(recorded, new, symmetry))
 
@@ -189,9 +189,9 @@ def _measured(events: Sequence[Event]) -> dict[str, float]:
 def best_pose_moves(
     recorded: Hypotheses, new: Hypotheses, symmetry: ObjectSymmetry
 ) -> tuple[float, float]:
-    """From the recorded best pose to the new one, metres and radians; NaN without a pose.
+    """Return how far the new best pose is off the recorded one, metres and radians.
 
-    symmetry: of the object, modulo which it is, at its centre.
+    symmetry: of the object, modulo which it is, at its centre. NaN without a pose.
     """
     if len(recorded.cost) == 0 or len(new.cost) == 0:
         return math.nan, math.nan

@@ -26,7 +26,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import inverse, quaternions
 from chsel.problem.registration_problem import ArchiveSnapshot
 from replay.arguments import STEPS_HELP, chosen_steps, path_argument
-from replay.comparing.beliefs import Beliefs
+from replay.comparing.beliefs import BeliefSequence
 from replay.console import Console
 from replay.files import new_file
 from replay.mcap.event_messages import step_numbers
@@ -278,7 +278,7 @@ def exported_modes(recording: Recording, steps: str | None) -> Exported:
 def _beliefs(recording: Recording) -> Iterator[Believed]:
     """The beliefs of all results that have a pose."""
     results = [step for step in recording.steps if recording.has_result(step)]
-    beliefs = Beliefs(recording) if results else None
+    beliefs = BeliefSequence(recording) if results else None
     for step in results:
         assert beliefs is not None
         belief = beliefs.after(recording.problem(step), recording.hypotheses(step))

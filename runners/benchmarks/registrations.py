@@ -21,7 +21,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads as on_threads
 from chsel.plausible.plausible_set import plausible_set
 from chsel.plausible.plausible_settings import plausible_settings
-from chsel.problem.online_registration import OnlineSettings, first_initial_set
+from chsel.problem.initial_sets import OnlineSettings, first_initial_set
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import (

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from chsel.errors import ChselError
+from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray, frozen, read_npz
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import PlausibleSet, load_plausible
@@ -22,8 +24,8 @@ from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, Regi
 from chsel.problem.search_space import search_space
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.qd.selection import ranked, repeated, select_elites
-from chsel.rehearsal import warm_up
-from chsel.session import Session
+from chsel.session.rehearsal import warm_up
+from chsel.session.run import Run
 from replay.environment import environment
 from replay.files import file_digest
 from runners.evaluation.contenders import MOST_REPEATS, Contender, repeat_label, repeat_seed
@@ -54,7 +56,7 @@ class ResultRows:
     def __init__(
         self, plan: Plan, trial: Trial, session: RecordedSession, label: str, holds: Any = None
     ) -> None:
-        """A session with faults is measured by the plausible sets of the same probes without any.
+        """Measure a session with faults by the plausible sets of the same probes without any.
 
         holds: of the method that made the hypotheses, tells whether its set has the truth.
         """
@@ -80,7 +82,7 @@ class ResultRows:
         return self._session.world_from_object
 
     def members(self, problem: RegistrationProblem) -> tuple[PlausibleSet | None, str]:
-        """The plausible set of a problem; else why there is none, "" where none is wanted."""
+        """Return the plausible set of a problem, else why not; "" where none is wanted."""
         step = problem.key.step
         if not self._plan.plausible:
             return None, ""
@@ -96,7 +98,7 @@ class ResultRows:
     def row(
         self, problem: RegistrationProblem, found: Hypotheses | None, failure: str = ""
     ) -> dict[str, Any]:
-        """The row of a step. found: None if the registration failed. failure: the reason for it."""
+        """Return the row of a step. found: None if the registration failed. failure: why."""
         points, (members, missing) = problem.points, self.members(problem)
         row: dict[str, Any] = {
             **self._about,
@@ -147,7 +149,7 @@ class ResultRows:
         return row | self._metrics.compute(of_session, members, found)
 
     def _of_session(self, problem: RegistrationProblem) -> RegistrationProblem:
-        """The problem without faults, with the same random numbers for all draws."""
+        """Return the problem without faults, with the same random numbers for all draws."""
         if self._clean_problems is not None:
             problem = self._clean_problems.get(problem.key.step, problem)
         return replace(problem, key=StreamKey(self._trial.seed, problem.key.step))
@@ -155,7 +157,7 @@ class ResultRows:
     def iterations(
         self, problem: RegistrationProblem, snapshots: Sequence[ArchiveSnapshot], settings: Any
     ) -> Iterator[Row]:
-        """The rows of a step's search, of a method with these settings."""
+        """Yield the rows of a step's search, of a method with these settings."""
         members, _ = self.members(problem)
         if members is None:
             return
@@ -177,7 +179,7 @@ class ResultRows:
 def hypotheses_of(
     snapshot: ArchiveSnapshot, problem: RegistrationProblem, settings: Any
 ) -> Hypotheses:
-    """The cells with the |E_0| lowest costs, chosen as the method with these settings does."""
+    """Return the cells with the |E_0| lowest costs, chosen as the method with the settings does."""
     space = search_space(settings.plane, problem.sdf)
     stream = problem.key.stream(Purpose.RESAMPLE, snapshot.refinement)
     costs, poses = -snapshot.objectives, space.poses(snapshot.solutions)
@@ -188,7 +190,7 @@ def hypotheses_of(
 def method_rows(
     plan: Plan, trial: Trial, contender: Contender, recorder: StepRecorder
 ) -> list[Row]:
-    """A row for every registration; those of searches, where wanted, become a part of a table."""
+    """Return a row for every registration; write those of searches, where wanted."""
     session, chosen = open_recorded(plan, trial), plan.steps_of(trial.configuration)
     method, leader = contender.method(), plan.leader()
     warm_up(method)  # so that no time holds the loading of compiled kernels
@@ -201,32 +203,16 @@ def method_rows(
         environment=environment(),
         # Problems of another method do not follow from the results of this one.
         source="" if leader is None else file_digest(trial.folder(plan) / "session.mcap"),
+        start=session.start_of(chosen if leader is None else None),
+        moves=session.push_distance,
     )
-    only = chosen if leader is None else None
-    online = (leader or method).online
-    run = Session.begun(
-        started,
-        method,
-        recorder,
-        online=session.online(online, repeat_seed(trial.seed, contender.draw), only=only),
-        symmetry=object_symmetry(session.recorded.mesh),
-        snapshot_interval=plan.every or 0,
-    )
-
-    def register_and_lead(run: Session) -> None:
-        """Remember the leader's result, which the next problem follows from."""
-        assert leader is not None
-        problem = run.online.pose(run.step)
-        if run.step in chosen:
-            try:
-                run.register_problem(problem)
-            except Exception as error:
-                run.failed(error)
-        run.online.remember(leader.register(problem))
-
-    walked = steps(run, session, catch=Exception)
-    if leader is not None:
-        walked = steps(run, session, register=register_and_lead)
+    run = Run(method, recorder, snapshot_interval=plan.every or 0)
+    if leader is None:
+        run.begin(started, seed=repeat_seed(trial.seed, contender.draw))
+        walked = steps(run, session, catch=Exception)
+    else:
+        run.begin(started, seed=repeat_seed(trial.seed, contender.draw), settings=leader.online)
+        walked = steps(run, session, register=partial(_lead, leader=leader, chosen=chosen))
     holds = getattr(method, "holds", None)
     result_rows = ResultRows(plan, trial, session, contender.label, holds)
     rows, iterations = list[Row](), list[Row]()
@@ -245,6 +231,17 @@ def method_rows(
         path = trial.folder(plan) / f"{contender.label}.iterations.parquet"
         write_part(path, iterations, ITERATIONS)
     return rows
+
+
+def _lead(run: Run, *, leader: Method, chosen: Collection[int]) -> None:
+    """Register the steps that are chosen; the next problem follows from the leader's result."""
+    problem = run.loop.problem()
+    if run.step in chosen:
+        try:
+            run.register_problem(problem)
+        except Exception as error:
+            run.fail(error)
+    run.loop.remember(leader.register(problem))
 
 
 class ExternalSetError(ChselError):
@@ -277,7 +274,7 @@ def external_digest(plan: Plan, trial: Trial, label: str) -> str:
 
 
 def read_external(plan: Plan, trial: Trial, label: str) -> dict[int, dict[str, Any]]:
-    """The sets of a trial in the folder of a label, by step; none without a file.
+    """Return the sets of a trial in the folder of a label, by step; none without a file.
 
     npz: arrays `step_K` (B, 4, 4), world_from_object of step K, best first; where known `cost_K`
     (B,) and `seconds_K`. json: the same as lists. Given as "step", "cost" and "seconds". Raises
@@ -318,7 +315,7 @@ def read_external(plan: Plan, trial: Trial, label: str) -> dict[int, dict[str, A
 
 
 def external_rows(plan: Plan, trial: Trial, label: str) -> list[Row]:
-    """The rows of the table about external results, of one trial."""
+    """Return the rows of the table about external results, of one trial."""
     sets, path = read_external(plan, trial, label), external_file(plan, trial, label)
     missing = f"{path} has no set of this step" if path.is_file() else f"there is no {path}"
     session = open_recorded(plan, trial)

@@ -10,17 +10,15 @@ import trimesh
 
 from chsel.belief import Gripper, PoseBelief, grasps_work, pose_offsets
 from chsel.next_probe.decision_problem import Belief, Decision
-from chsel.next_probe.forecast import belief_after, belief_before
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.symmetry import object_symmetry
 from chsel.policies.policy import PolicySettings, StopSettings
 from chsel.problem import surface
-from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.poses import Poses, compose, inverse, random_rotations, rotated
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import Purpose, StreamKey, uniforms
-from chsel.rehearsal import warm_up, warm_up_policy
-from chsel.session import Session
+from chsel.session.rehearsal import warm_up, warm_up_policy
+from chsel.session.run import Run
 from runners.evaluation.contenders import Contender
 from runners.evaluation.experiment import Row
 from runners.evaluation.plan import Plan, Trial
@@ -37,7 +35,7 @@ _WIDEST = 3  # directions
 def policy_rows(
     plan: Plan, trial: Trial, contender: Contender, recorder: StepRecorder
 ) -> list[Row]:
-    """A row for every probe of a session as `runners.probe` has it, until the budget is spent."""
+    """Return a row for every probe of a session as `runners.probe` has it, within the budget."""
     (registering,) = plan.contenders.values()
     method, policy = registering.method(), contender.policy()
     warm_up(method)  # so that no time holds the loading of compiled kernels
@@ -46,18 +44,17 @@ def policy_rows(
     scene, rows = open_scene(config), list[Row]()
     try:
         started = session_started(config, config_values(config), registering.name, scene)
-        session = Session.begun(
-            replace(started, runner="evaluate"),
+        run = Run(
             method,
             recorder,
-            online=scene.online(method.online, trial.seed),
-            symmetry=object_symmetry(scene.mesh),
-            steering=scene.steering,
+            policy=scene.policy,
+            with_belief=True,
             snapshot_interval=RecordingConfig.snapshot_interval,
         )
+        scene.begin(run, replace(started, runner="evaluate"))
         about = plan.about(trial, contender.label)
-        for numbers in steps(session, scene.session, catch=Exception):
-            rows.append(about | _row(scene, settings, trial.seed, numbers, session))
+        for numbers in steps(run, scene.session, catch=Exception):
+            rows.append(about | _row(scene, settings, seed=trial.seed, numbers=numbers, run=run))
             if len(rows) >= settings.probes:  # of a session that no policy ends
                 break
     finally:
@@ -66,28 +63,25 @@ def policy_rows(
 
 
 def _row(
-    scene: Scene,
-    settings: PolicySettings,
-    seed: int,
-    numbers: Row,
-    session: Session,
+    scene: Scene, settings: PolicySettings, *, seed: int, numbers: Row, run: Run
 ) -> dict[str, Any]:
-    """What is known after a step. numbers: the step's own row."""
-    assert scene.session.world_from_object is not None
-    truth = Poses.of(inverse(scene.session.world_from_object[None]))
+    """Return what is known after a step. numbers: the step's row by `steps`."""
+    true_pose = scene.session.world_from_object
+    assert true_pose is not None
+    truth = Poses.of(inverse(true_pose[None]))
 
     def errors(poses: FloatArray) -> FloatArray:
-        """How far the surface in poses (B, 4, 4), object_from_world, is from the true one (B,)."""
+        """Return how far the surface in poses (B, 4, 4), object_from_world, is off (B,), metres."""
         return surface.outline_distances_to(scene.sdf, Poses.of(poses), truth)
 
-    after, online = None if session.steering is None else session.steering.last, session.online
-    key = StreamKey(seed, session.step + 1)
-    belief = _belief(scene, settings, key, online) if after is None else after.problem.belief
+    after = run.loop.state.decided
+    found = run.loop.state.previous
+    belief = run.loop.belief(settings.belief) if after is None else after.problem.belief
     error = surface.in_order(belief.weights * errors(belief.object_from_world))
     row: dict[str, Any] = {
-        "step": session.step,
-        "probes": session.step + 1,
-        "status": f"failed: {session.failure}" if session.failure else "ok",
+        "step": run.step,
+        "probes": run.step + 1,
+        "status": f"failed: {run.failure}" if run.failure else "ok",
         "contacts": numbers["contacts"],
         "free_points": numbers["free_points"],
         "hit": numbers["outcome"] == "contact",
@@ -99,45 +93,54 @@ def _row(
         "hit_forecast": numbers.get("hit_chance"),
         "forecast_spread": numbers.get("expected_spread"),
     }
-    found = online.previous
     if found is not None and len(found.cost) > 0:
         distances = errors(found.object_from_world)
         row |= {"error": float(distances.mean()), "best_error": float(distances[0])}
-    if session.registered is not None and session.problem is not None:
-        hypotheses = session.registered.hypotheses
+    if run.registered is not None and run.problem is not None:
+        hypotheses = run.registered.hypotheses
         row |= {
             "hypotheses": len(hypotheses.cost),
             "verdict": numbers.get("verdict"),
             "digest": hypotheses.digest,
-            "problem_digest": session.problem.digest,
-            "seconds": session.registered.total_seconds,
+            "problem_digest": run.problem.digest,
+            "seconds": run.registered.total_seconds,
         }
-        if hypotheses.trust is not None:
-            pose, at = scene.session.world_from_object, StreamKey(seed, session.step)
-            row |= belief_numbers(session.belief, scene.mesh, scene.sdf, pose, at)
+        if hypotheses.trust is not None and run.belief is not None:
+            row |= belief_numbers(
+                run.belief,
+                scene.mesh,
+                sdf=scene.sdf,
+                world_from_object=true_pose,
+                key=StreamKey(seed, run.step),
+            )
     trust = None if found is None else found.trust
     verdict = "" if trust is None else trust.verdict
+    diameter = scene.sdf.diameter
     if after is None:
-        return row | {"stop": usual_stop(row["spread"], None, scene.sdf.diameter, verdict)}
-    spread, promised = after.decision.spread, promised_gain(after.decision)
+        stop = usual_stop(row["spread"], None, diameter=diameter, verdict=verdict)
+        return row | {"stop": stop}
+    spread = after.decision.spread
+    promised = promised_gain(after.decision)
+    stop = usual_stop(spread, promised, diameter=diameter, verdict=verdict)
     return row | {
         "spread": spread,
         "promised": promised,
         "surprise": numbers["surprise"],
         "decision_seconds": numbers["seconds_by_stage"].get("decision"),
         "decision_digest": after.decision.digest,
-        "stop": usual_stop(spread, promised, scene.sdf.diameter, verdict) or after.decision.stop,
+        "stop": stop or after.decision.stop,
     }
 
 
 def belief_numbers(
     belief: PoseBelief,
     mesh: trimesh.Trimesh,
+    *,
     sdf: SdfGrid,
     world_from_object: FloatArray,
     key: StreamKey,
 ) -> Row:
-    """How far a belief is right about the true pose (4, 4), and about grasps."""
+    """Return how far a belief is right about the true pose (4, 4), and about grasps."""
     symmetry = object_symmetry(mesh)
     truth, members = inverse(world_from_object), belief.object_from_world
     off = pose_offsets(symmetry, members[0], np.concatenate([truth[None], members]))
@@ -161,31 +164,20 @@ def belief_numbers(
     return row | {"grasp_chance": float(chance[best]), "grasp_works": bool(works[0, 0])}
 
 
-def _belief(
-    scene: Scene, settings: PolicySettings, key: StreamKey, online: OnlineRegistration
-) -> Belief:
-    """What a policy would weigh up in a session that makes no decisions."""
-    found = online.previous
-    if found is not None and len(found.cost) > 0:
-        return belief_after(found, settings.belief)
-    points, workspace = online.points, scene.session.workspace
-    return belief_before(scene.sdf, points, workspace, key, settings.belief)
-
-
 def spread_of(sdf: SdfGrid, belief: Belief) -> float:
-    """Spread of a belief, metres, as decisions have it."""
+    """Return the spread of a belief, metres, as decisions have it."""
     poses = Poses.of(belief.object_from_world)
     return surface.surface_spread(surface.outline_distances(sdf, poses), belief.weights)
 
 
 def promised_gain(decision: Decision) -> float | None:
-    """By how much the best action would narrow the belief, metres; None if there is none."""
+    """Return by how much the best action would narrow the belief, metres; None without one."""
     spreads = decision.expected_spread[np.isfinite(decision.score)]
     return decision.spread - float(spreads.min()) if len(spreads) else None
 
 
-def usual_stop(spread: float, promised: float | None, diameter: float, verdict: str) -> str:
-    """Why a session would end by the rules that policies have by default; "" if it goes on.
+def usual_stop(spread: float, promised: float | None, *, diameter: float, verdict: str) -> str:
+    """Return why a session would end by the default rules of policies; "" if it goes on.
 
     spread, promised: of the belief and by the best action, metres. diameter: of the object.
     """

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from chsel.errors import ChselError, SettingError
 from chsel.numerics.threads import threads
-from chsel.registration import one_line
+from chsel.session.recording import one_line
 from runners.evaluation.experiment import PROBES, RESULTS, part_source, write_part
 from runners.evaluation.plan import Plan, Task, Trial
 from runners.evaluation.run_method import external_digest, external_rows, method_rows

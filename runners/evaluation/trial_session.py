@@ -16,7 +16,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.plausible import plausible_set as sets
 from chsel.plausible.plausible_set import PlausibleSet
 from chsel.plausible.plausible_settings import PlausibleSettings
-from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.registration_problem import ArchiveSnapshot, RegistrationProblem
 from replay.files import WritingError, whole_file
 from replay.mcap.writer import McapRecorder
@@ -128,7 +128,7 @@ def record_session(plan: Plan, trial: Trial, recorder: Recorder) -> None:
             truth, values[TRUTH] = sought_pose(at_end, scene.mesh, guess, plan.truth, known)
             values["session"] |= {"path": f"{trial.configuration}/{log.name}"}
         started = session_started(config, values, "none", scene)
-        recorder.record(replace(started, runner="evaluate", world_from_object=truth))
+        recorder.record(replace(started, runner="evaluate", world_from_object=truth, start=None))
         for event in events:
             recorder.record(event)
             if isinstance(event, Probe):
@@ -182,10 +182,9 @@ def plausible_settings_of(plan: Plan, session: RecordedSession) -> PlausibleSett
 def problems(
     plan: Plan, trial: Trial, session: RecordedSession, settings: OnlineSettings = _ONE
 ) -> Iterator[RegistrationProblem]:
-    """What is known at every step with a registration, of which none follows from a result."""
-    online = session.online(settings, trial.seed, only=plan.steps_of(trial.configuration))
-    steps = online.steps(session.perceived())
-    return (step.problem for step in steps if step.problem is not None)
+    """Yield the problem of every step with a registration; none follows from a result."""
+    loop = session.loop(settings, seed=trial.seed, steps=plan.steps_of(trial.configuration))
+    return loop.problems(session.probes())
 
 
 def made_set(

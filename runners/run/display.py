@@ -1,4 +1,4 @@
-"""What a run says on the terminal."""
+"""Terminal output of a run."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from rich.filesize import decimal
 from rich.progress import TimeElapsedColumn
 
 from chsel.errors import InputWarning
+from chsel.events import Decided
 from chsel.numerics.compiler import watched
-from chsel.policies.steering import Steering
 from chsel.problem.poses import quaternions
 from chsel.problem.registration_problem import VERDICTS, Trust
-from chsel.session import FROM_SESSION, Session, StepWarning
+from chsel.session.run import FROM_SESSION, Run, StepWarning
 from replay.console import Console, Progress, TextColumn, plain_table
 from runners.sensors.session_report import Report
 
@@ -89,27 +89,28 @@ class Display:
         self._console.print(title, style="bold")
 
     def probes(self, count: int) -> None:
-        """How many there will be; their numbers are the steps of the recording."""
+        """Say how many there will be; their numbers are the steps of the recording."""
         numbers = f"probes 0 to {count - 1}" if count > 1 else "probe 0"
         self.say(f"{numbers}, numbered as the steps of the recording")
 
-    def stopped(self, steering: Steering) -> None:
-        """Why a steered session has ended, if it has by its policy."""
-        if steering.last is not None and steering.last.decision.stop:
-            problem, decision = steering.last
-            text = f"stopped after {problem.key.step} probes: {STOPPED[decision.stop]}"
-            if problem.verdict not in ("", VERDICTS[0]):
-                text += f"; the pose is not determined ({problem.verdict})"
-            self.say(text)
+    def stopped(self, decided: Decided) -> None:
+        """Say why the policy has ended the session, if it has."""
+        stop = decided.decision.stop
+        if not stop:
+            return
+        problem = decided.problem
+        text = f"stopped after {problem.key.step} probes: {STOPPED[stop]}"
+        if problem.verdict not in ("", VERDICTS[0]):
+            text += f"; the pose is not determined ({problem.verdict})"
+        self.say(text)
 
-    def grasped(self, session: Session) -> None:
-        """That touching has ended as a grasp works, and where it is."""
-        assert session.grasp is not None
-        chance = f"{100.0 * session.grasp_chance:.0f} %"
+    def grasped(self, run: Run) -> None:
+        """Say that touching has ended as a grasp works, and where it is."""
+        chance = f"{100.0 * run.grasp_chance:.0f} %"
         self.say(f"stopped: a grasp works with a chance of {chance} (summary.json has its pose)")
 
     def probe(self, row: Mapping[str, Any]) -> None:
-        """A probe, and the registration after it if there was one, are done."""
+        """Print a line about a probe, and the registration after it if there was one."""
         text = f"probe {row['step']:>3} {row['outcome']:<7} {row['contacts']:>3} contacts"
         text += f" {row['free_points']:>6} free"
         if "set_spread" in row:
@@ -124,11 +125,11 @@ class Display:
                 self.say(f"warning: {warning.text}")
 
     def say(self, text: str) -> None:
-        """A line of its own."""
+        """Print a line."""
         self._console.print(text)
 
     def table(self, rows: list[dict[str, Any]]) -> None:
-        """The registrations of the session, with errors to the true pose where it is known."""
+        """Print the registrations, with errors to the true pose where it is known."""
         rows = [row for row in rows if "best_cost" in row]
         if not rows:
             self.say("no registration: too few contacts or probes for one")
@@ -157,7 +158,7 @@ class Display:
         self._console.print(table)
 
     def sensed(self, report: Report) -> None:
-        """What became of a robot's sensor data, and what was wrong with it."""
+        """Print how much of a robot's sensor data was used, and what was wrong with it."""
         total = {name: vars(counts) for name, counts in report.total().items() if counts.images}
         columns = {
             title: field
@@ -174,7 +175,7 @@ class Display:
             self.say(f"warning: {text}" if level == "warning" else text)
 
     def written(self, folder: Path) -> None:
-        """What lies in the run's folder, and how to look at it; paths on lines of their own."""
+        """Print the files of the run's folder, and how to look at them."""
         self._console.print(f"{folder}/", soft_wrap=True)
         for file in sorted(folder.iterdir()):
             self.say(f"  {file.name:<15} {decimal(file.stat().st_size):>9}")
@@ -183,7 +184,7 @@ class Display:
                 self._console.print(f"    {viewer} --bind 127.0.0.1", soft_wrap=True)
 
     def pose(self, rows: list[dict[str, Any]]) -> None:
-        """The best pose of the last registration that found one."""
+        """Print the best pose of the last registration that found one."""
         row = next((row for row in reversed(rows) if "world_from_object" in row), None)
         if row is None:
             return
@@ -200,6 +201,6 @@ class Display:
             self.say(f"  modes have {shares} of the poses")
 
     def verdict(self, trust: Trust | None) -> None:
-        """How far to trust the last result, if there is one."""
+        """Print how far to trust the last result, if there is one."""
         if trust is not None:
             self.say(f"{MEANINGS[trust.verdict]}: {trust}")

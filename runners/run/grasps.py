@@ -33,7 +33,7 @@ class GraspConfig(CheckedSettings):
     gripper: Gripper = field(default_factory=Gripper)
 
     def grasps(self) -> Grasps | None:
-        """The grasps of the file. Raises SettingError if it is not as it should be."""
+        """Return the grasps of the file. Raise SettingError for one that is not valid."""
         if self.path is None:
             return None
         try:

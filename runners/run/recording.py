@@ -16,7 +16,7 @@ from replay.files import whole_file
 
 @dataclass(frozen=True)
 class RecordingConfig(CheckedSettings):
-    """What is written down of a session."""
+    """Settings of recording a session."""
 
     mcap: bool = True  # write recording.mcap
     rerun: bool = True  # write recording.rrd
@@ -28,7 +28,7 @@ class RecordingConfig(CheckedSettings):
 
 
 def make_run_folder(logs: Path, *names: str) -> Path:
-    """A new folder TIME_NAME_NAME_ID in `logs`; the random id keeps two runs of a second apart.
+    """Make a folder TIME_NAME_NAME_ID in `logs`; the random id keeps two runs of a second apart.
 
     Of names, which may come from a file, only letters, digits and a few signs are taken.
     """

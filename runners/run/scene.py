@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from chsel.errors import InputWarning, SessionError
-from chsel.events import SessionStarted
+from chsel.events import SessionStarted, Start
+from chsel.next_probe.decision_problem import Actions
 from chsel.numerics.threads import require_threads
 from chsel.policies import build_policy
-from chsel.policies.steering import Steering
-from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
+from chsel.policies.policy import Policy
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
+from chsel.session.run import Run
 from replay.environment import environment
 from runners.objects.loader import ObjectConfig, check_size, load_object
 from runners.objects.scans import AssetsConfig
@@ -36,7 +37,7 @@ PROBED_BY_US = ("simulated", "kinematic")
 """Kinds of sessions that place the object and choose their probes themselves."""
 _OF_REAL_OBJECTS = ("points", "sensors")  # sessions whose points come from real objects
 FIRST_CONTACT = Start(contacts=1)
-"""When a steered session begins to register."""
+"""When a session with a policy begins to register."""
 _NOT_OF_THE_RESULT = ("assets", "logs", "recording", "threads")
 
 
@@ -81,25 +82,26 @@ class Scene:
     # Spacing of the SDF grid that the settings ask for, metres; None: that of `object_grid`.
     object_resolution: float | None = None
     warnings: tuple[InputWarning, ...] = ()  # about the object and a file of points
-    steering: Steering | None = None  # chooses the probes; None for the session's own order
+    policy: Policy | None = None  # chooses the probes; None for the session's own order
+    actions: Actions | None = None  # that a policy chooses from
 
     @property
     def report(self) -> Report | None:
         """What became of sensors' images, once they are read."""
         return getattr(self.session, "report", None)
 
-    def online(self, settings: OnlineSettings, seed: int) -> OnlineRegistration:
-        """The loop of the session, before its first step; see `OnlineRegistration`."""
-        return OnlineRegistration(
-            self.sdf,
-            self.session.workspace,
-            self.session.free_resolution,
-            settings,
-            seed=seed,
-            points=self.session.initial_points,
-            start=self.start,
-            push_distance=getattr(self.session, "push_distance", 0.0),
-        )
+    @property
+    def moves(self) -> float:
+        """Metres that a probe moves the object at most."""
+        return float(getattr(self.session, "push_distance", 0.0))
+
+    def begin(self, run: Run, started: SessionStarted) -> None:
+        """Open the recording of a run over the session, and offer the actions."""
+        run.begin(started)
+        if self.actions is not None:
+            assert isinstance(self.session, Steerable)
+            run.offer(self.actions, self.session.hand)
+        run.flush()
 
 
 def open_scene(config: ProbeConfig) -> Scene:
@@ -126,7 +128,7 @@ def open_scene(config: ProbeConfig) -> Scene:
             session = open_session(kind, settings, model, config.seed)
             sdf = model.grid(settings)
         name, mesh, resolution = model.name, model.mesh, model.resolution(settings)
-        start = Start(settings.start_contacts, settings.start_probe)
+        start = Start(contacts=settings.start_contacts, step=settings.start_probe)
         found += getattr(session, "warnings", [])
         if kind in _OF_REAL_OBJECTS:
             found += check_size(model, session.workspace)
@@ -137,10 +139,17 @@ def open_scene(config: ProbeConfig) -> Scene:
             f"session {kind} cannot be steered, as its probes are given; accepted: policy=grid, or "
             "session=kinematic, simulated or recorded"
         )
-    actions = session.offer(policy.settings.actions)
-    place = sdf, session.workspace, session.free_resolution
-    steering = Steering(policy, *place, actions, session.hand, seed=config.seed)
-    return Scene(session, name, mesh, sdf, FIRST_CONTACT, resolution, tuple(found), steering)
+    return Scene(
+        session=session,
+        object_name=name,
+        mesh=mesh,
+        sdf=sdf,
+        start=FIRST_CONTACT,
+        object_resolution=resolution,
+        warnings=tuple(found),
+        policy=policy,
+        actions=session.offer(policy.settings.actions),
+    )
 
 
 @contextmanager
@@ -160,7 +169,7 @@ def _caught() -> Iterator[list[InputWarning]]:
 def session_started(
     config: ProbeConfig, values: Mapping[str, Any], method_name: str, scene: Scene
 ) -> SessionStarted:
-    """The first event of the recording."""
+    """Return the first event of the recording."""
     session = scene.session
     recorded = {key: value for key, value in values.items() if key not in _NOT_OF_THE_RESULT}
     used = {
@@ -172,7 +181,7 @@ def session_started(
         key: used.get(key) if value is None else value
         for key, value in without_defaults(values["session"]).items()
     }
-    if scene.steering is None:
+    if scene.policy is None:
         recorded.pop("policy", None)
     if config.grasp.path is None:
         recorded.pop("grasp", None)
@@ -190,4 +199,6 @@ def session_started(
         initial_points=session.initial_points,
         world_from_object=session.world_from_object,
         environment=environment(),
+        start=scene.start,
+        moves=scene.moves,
     )

@@ -1,4 +1,4 @@
-"""A session from its first probe to its last, whoever probes: Algorithm 2, recorded."""
+"""A run over a source of probes, from the first to the last: Algorithm 2, recorded."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from chsel.belief import Mode, wilson
-from chsel.events import Logged, Probe, Timed
+from chsel.events import Decided, Logged, Probe, Timed
 from chsel.problem.poses import inverse
-from chsel.registration import Registered
-from chsel.session import Session
+from chsel.session.recording import Registered
+from chsel.session.run import Run
 from runners.run.grasps import Grasps
 from runners.sessions.source import ProbeEvent, ProbeSource, Steerable
 
@@ -18,67 +18,67 @@ Row = dict[str, Any]
 
 
 def steps(
-    session: Session,
+    run: Run,
     source: ProbeSource,
     *,
-    register: Callable[[Session], object] = Session.register_step,
+    register: Callable[[Run], object] = Run.register,
     catch: type[Exception] | tuple[type[Exception], ...] = (),
     timings: bool = False,
-    belief: bool = False,
     grasps: Grasps | None = None,
 ) -> Iterator[Row]:
-    """Walk a session over a source; after each probe the numbers that are shown of it.
+    """Walk a run over a source; yield after each probe the numbers that are shown of it.
 
     register: of a step with enough points. catch: errors of a step that do not end the session.
-    timings: whether wall-clock times are recorded. belief: whether the belief is. grasps: one of
-    which ends the session as soon as it works with the chance that is wanted.
+    timings: whether wall-clock times are recorded. grasps: one of which ends the session as soon as
+    it works with the chance that is wanted.
     """
-    if session.steering is not None:
-        _decide(session, source)
-        session.flush()
+    if run.policy is not None:
+        _decide(run, source)
+        run.flush()
     begun = time.perf_counter()
-    for event in _events(session, source):
-        session.observe(event)
+    for event in _events(run, source):
+        run.observe(event)
         if not isinstance(event, Probe):
             continue
-        session.seconds["probe"] = time.perf_counter() - begun
-        if session.online.enough(session.step):
+        run.seconds["probe"] = time.perf_counter() - begun
+        if run.loop.enough:
             try:
-                register(session)
+                register(run)
             except catch as error:
-                session.failed(error)
-        points = session.online.points
+                run.fail(error)
+        points = run.loop.state.points
         row: Row = {
-            "step": session.step,
-            "outcome": session.outcome,
+            "step": run.step,
+            "outcome": run.outcome,
             "contacts": len(points.contacts),
             "free_points": len(points.free),
         }
-        if session.registered is not None:
-            row |= _numbers(session.registered)
-            if belief and session.registered.hypotheses.trust is not None:
-                row["belief"] = [_mode(mode) for mode in session.belief.modes]
-            if grasps is not None and session.registered.hypotheses.trust is not None:
-                row |= _grasp(session, grasps)
-        if session.steering is not None:
-            row |= _decide(session, source)
-        text = f"probe {session.step}: {row['outcome']}, {row['contacts']} contacts"
+        if run.registered is not None:
+            row |= _numbers(run.registered)
+            has_pose = run.registered.hypotheses.trust is not None
+            if has_pose and run.belief is not None:
+                row["belief"] = [_mode(mode) for mode in run.belief.modes]
+            if has_pose and grasps is not None:
+                row |= _grasp(run, grasps)
+        if run.policy is not None:
+            row |= _decide(run, source)
+        text = f"probe {run.step}: {row['outcome']}, {row['contacts']} contacts"
         if "digest" not in row:
             text += ", too little for a registration"
-        text += f"; {session.trust}" if "verdict" in row else ""
-        session.observe(Logged(session.step, "info", text))
+        text += f"; {run.trust}" if "verdict" in row else ""
+        run.observe(Logged(run.step, "info", text))
         if timings:
-            session.observe(Timed(session.step, session.seconds))
-        session.flush()
-        yield row | {"seconds": sum(session.seconds.values()), "seconds_by_stage": session.seconds}
-        if session.stop == "grasp":
+            run.observe(Timed(run.step, run.seconds))
+        run.flush()
+        yield row | {"seconds": sum(run.seconds.values()), "seconds_by_stage": run.seconds}
+        if run.stop == "grasp":
             break
         begun = time.perf_counter()
-    session.end_points()
+    run.check_points_at_end()
 
 
 def _numbers(registered: Registered) -> Row:
-    """Numbers about a registration."""
+    """Return numbers about a registration."""
     found, trust = registered.hypotheses, registered.hypotheses.trust
     row: Row = {"best_cost": float(found.cost[0])} if len(found.cost) else {}
     row |= {"distinct": found.distinct, "digest": found.digest, **registered.numbers}
@@ -91,41 +91,51 @@ def _numbers(registered: Registered) -> Row:
 
 
 def _mode(mode: Mode) -> Row:
-    """Numbers about a mode of a belief; metres and radians."""
+    """Return numbers about a mode of a belief; metres and radians."""
     position, rotation = mode.deviations
     numbers: Row = {"number": mode.number, "weight": mode.weight}
     return numbers | {"position_deviation": position, "rotation_deviation": rotation}
 
 
-def _grasp(session: Session, grasps: Grasps) -> Row:
-    """The best grasp, its chance with a 90 % interval, and that the session ends if it does."""
-    stop = {"stop": session.stop} if session.grasped(*grasps) else {}
-    assert session.grasp is not None
-    _, lower, upper = wilson(session.grasp_chance, len(session.belief))
-    row: Row = {"grasp": session.grasp.tolist(), "grasp_chance": session.grasp_chance}
-    return row | {"grasp_chance_interval": [float(lower), float(upper)]} | stop
+def _grasp(run: Run, grasps: Grasps) -> Row:
+    """Return the best grasp, its chance with a 90 % interval, and whether the session ends."""
+    is_sure = run.is_graspable(
+        grasps.object_from_gripper, grasps.width, gripper=grasps.gripper, sure=grasps.sure
+    )
+    assert run.grasp is not None
+    assert run.belief is not None
+    _, lower, upper = wilson(run.grasp_chance, len(run.belief))
+    row: Row = {"grasp": run.grasp.tolist(), "grasp_chance": run.grasp_chance}
+    row["grasp_chance_interval"] = [float(lower), float(upper)]
+    return row | ({"stop": run.stop} if is_sure else {})
 
 
-def _events(session: Session, source: ProbeSource) -> Iterator[ProbeEvent]:
-    """What a source yields, in its own order or as the session steers it."""
-    if session.steering is None:
+def _events(run: Run, source: ProbeSource) -> Iterator[ProbeEvent]:
+    """Yield what a source does, in its own order or by the decisions of the run."""
+    if run.policy is None:
         yield from source.probes()
         return
     assert isinstance(source, Steerable)
     step = 0
-    while session.steering.last is not None and session.steering.last.decision.chosen >= 0:
-        yield from source.take(step, session.steering.last.decision.chosen)
+    while (chosen := _decided(run).decision.chosen) >= 0:
+        yield from source.take(step, chosen)
         step += 1
 
 
-def _decide(session: Session, source: ProbeSource) -> Row:
-    """Choose what follows a step; numbers about the choice, and about the one before."""
+def _decided(run: Run) -> Decided:
+    """Return the last decision."""
+    decided = run.loop.state.decided
+    assert decided is not None
+    return decided
+
+
+def _decide(run: Run, source: ProbeSource) -> Row:
+    """Choose what follows a step; return numbers about the choice, and about the one before."""
     assert isinstance(source, Steerable)
-    assert session.steering is not None
-    before = session.steering.last
-    row: Row = {"surprise": session.steering.surprise}
-    if session.stop != "grasp":
-        decision = session.decide(source.available()).decision
+    before = run.loop.state.decided
+    row: Row = {"surprise": run.loop.state.surprise}
+    if run.stop != "grasp":
+        decision = run.decide(source.available()).decision
         row |= {"spread": decision.spread, "stop": decision.stop}
     if before is not None:
         chosen = before.decision.chosen

@@ -19,7 +19,7 @@ from chsel.problem.mesh import clean_mesh, load_mesh
 from chsel.problem.points import FREE_RESOLUTION, Workspace
 from chsel.problem.poses import inverse
 from chsel.problem.settings import CheckedSettings, build_settings, not_negative, positive
-from chsel.session import Session
+from chsel.session.session import Session
 
 if TYPE_CHECKING:
     import trimesh
@@ -82,7 +82,7 @@ def add(session: Session, values: Json) -> Json:
     hand = values.pop("hand", None)
     arrays = _arrays(values)
     session.add(**arrays, hand=None if hand is None else _mesh("hand", hand))
-    points = session.online.points
+    points = session.points
     counts = {name: len(getattr(points, name)) for name in ("known", "free", "occupied")}
     return {"step": session.step, "points": counts, "warnings": _warnings(session)}
 

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 from aiohttp import web
 
 from chsel.errors import ChselError, SettingError, quoted
-from chsel.registration import one_line
-from chsel.session import Session
+from chsel.session.recording import one_line
+from chsel.session.session import Session
 from replay.console import print_error
 from runners.serving import messages
 

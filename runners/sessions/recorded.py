@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -10,16 +10,17 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import PointsError, PoseError, SessionError, SettingError
-from chsel.events import Probe
+from chsel.events import Probe, Start
 from chsel.next_probe.action_lattice import ActionSettings, straight_actions
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
-from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
+from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.points import KnownPoints, Lattice, check_points
 from chsel.problem.poses import apply, nearest_rigid
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
 from chsel.sensing.free_space import interior_lattice, poses_between
+from chsel.session.loop import Loop
 from replay.mcap.reader import read_recording
 from runners.sessions.probing_hand import DescribedHand, open_hand
 from runners.sessions.probing_settings import ProbingSettings, expected_moves
@@ -57,10 +58,8 @@ class RecordedSession:
         self.world_from_object, self.initial_points = start.world_from_object, start.initial_points
         self.count = len(self._probes)
         self._config: Mapping[str, Any] = start.config.get("session", {})
-        self.push_distance = expected_moves(self._config)
-        chosen = {name: self._config.get(name) or 0 for name in ("start_contacts", "start_probe")}
-        chosen |= {name: value for name, value in vars(settings).items() if value is not None}
-        self.start = Start(chosen["start_contacts"], chosen["start_probe"])
+        self.push_distance = expected_moves(self._config) if start.moves is None else start.moves
+        self.start = _start(settings, self._config)
         new = [probe.new_points for probe in self._probes]
         every = KnownPoints.joined([self.initial_points, *new])
         try:  # before any work; warnings are given when the points become known
@@ -126,28 +125,40 @@ class RecordedSession:
         except (PoseError, SessionError) as error:
             raise SessionError(f"recording {self._recording.path}: {error}") from None
 
-    def online(
-        self, settings: OnlineSettings, seed: int, *, only: Container[int] | None = None
-    ) -> OnlineRegistration:
-        """The loop of this session, before its first step; see `OnlineRegistration`."""
-        return OnlineRegistration(
+    def loop(
+        self, settings: OnlineSettings, *, seed: int, steps: Collection[int] | None = None
+    ) -> Loop:
+        """Return the loop of this session, before its first probe.
+
+        settings, seed: as of `Loop`. steps: of no others than these; None for all.
+        """
+        return Loop(
             self.recorded.sdf,
             self.workspace,
-            self.free_resolution,
-            settings,
+            free_resolution=self.free_resolution,
+            settings=settings,
             seed=seed,
             points=self.initial_points,
-            start=self.start,
-            only=only,
-            push_distance=self.push_distance,
+            start=self.start_of(steps),
+            moves=self.push_distance,
         )
 
-    def perceived(self) -> Iterator[tuple[int, KnownPoints, FloatArray | None]]:
-        """The steps of the session with the points that are new in each, and pushes."""
-        return ((probe.step, probe.new_points, probe.push) for probe in self.probes())
+    def start_of(self, steps: Collection[int] | None) -> Start:
+        """Return when steps register, if it is none but these; None for all."""
+        return replace(self.start, steps=None if steps is None else tuple(sorted(steps)))
 
     def close(self) -> None:
         """Nothing is held open."""
+
+
+def _start(settings: RecordedSettings, config: Mapping[str, Any]) -> Start:
+    """Return when steps register: by the settings, else as in the configuration recorded."""
+    contacts = settings.start_contacts
+    step = settings.start_probe
+    return Start(
+        contacts=config.get("start_contacts") or 0 if contacts is None else contacts,
+        step=config.get("start_probe") or 0 if step is None else step,
+    )
 
 
 _ASIDE = 0.010  # m: from the line of a push, what is before it

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 import trimesh
 
+from chsel.problem.initial_sets import posed_problem
 from chsel.problem.noise import EXTENT, INDEPENDENT, LATER, SHARE
-from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.poses import apply, compose, hat, random_rotations
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.sdf_grid import SdfGrid
@@ -126,8 +126,13 @@ def _unit(vectors):
 
 
 def pose_problem(sdf, points, workspace, free_resolution, key, settings, previous):
-    """The problem of a step, as an online registration poses it."""
-    online = OnlineRegistration(
-        sdf, workspace, free_resolution, settings, seed=key.seed, points=points, previous=previous
+    """Return the problem of a step, as a loop poses it."""
+    return posed_problem(
+        sdf,
+        points,
+        workspace=workspace,
+        free_resolution=free_resolution,
+        key=key,
+        settings=settings,
+        previous=previous,
     )
-    return online.pose(key.step)

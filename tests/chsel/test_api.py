@@ -1,6 +1,7 @@
 import dataclasses
 import re
 import warnings
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 
@@ -25,7 +26,7 @@ def register(**arguments):
 
 
 def test_a_mesh_and_points_are_all_it_takes():
-    found = chsel.register(BOX, surface=torch.tensor(SURFACE))
+    found = chsel.register(BOX, contacts=torch.tensor(SURFACE))
     assert found.object_from_world.shape == (30, 4, 4)
     # A box looks the same after half turns about its axes, so only its centre is unique.
     best = inverse(found.object_from_world[0])
@@ -33,7 +34,7 @@ def test_a_mesh_and_points_are_all_it_takes():
 
 
 def test_contacts_are_points_on_the_surface_and_have_a_name():
-    expected = register(surface=SURFACE)
+    expected = register(contacts=SURFACE)
     assert register(contacts=SURFACE).digest == expected.digest
     np.testing.assert_array_equal(expected.world_from_object, inverse(expected.object_from_world))
     with pytest.raises(chsel.ChselError, match=r"accepted: chsel\.register\(mesh, contacts=points"):
@@ -42,21 +43,21 @@ def test_contacts_are_points_on_the_surface_and_have_a_name():
 
 def test_a_grid_that_is_kept_a_mesh_lists_and_tensors_give_the_same_bits(monkeypatch):
     grid = chsel.SdfGrid.from_mesh(BOX, 0.002)
-    digest = register(surface=SURFACE).digest
-    assert register(surface=SURFACE.tolist()).digest == digest
-    assert chsel.register(grid, surface=SURFACE, method="chsel", settings=QUICK).digest == digest
+    digest = register(contacts=SURFACE).digest
+    assert register(contacts=SURFACE.tolist()).digest == digest
+    assert chsel.register(grid, contacts=SURFACE, method="chsel", settings=QUICK).digest == digest
     monkeypatch.setattr("chsel.problem.sdf_grid.mesh_sdf", None)
-    assert register(surface=SURFACE, seed=1).digest != digest
+    assert register(contacts=SURFACE, seed=1).digest != digest
 
 
 def test_points_added_later_start_from_the_previous_result():
-    first = register(surface=SURFACE[:20])
-    second = register(surface=SURFACE, previous=first, step=1)
+    first = register(contacts=SURFACE[:20])
+    second = register(contacts=SURFACE, previous=first, step=1)
     cost = chsel.RelaxedCost(chsel.SdfGrid.from_mesh(BOX, 0.002), chsel.KnownPoints(known=SURFACE))
     assert second.cost[0] <= cost.evaluate(first.elites).min() + 1e-12
     bare = dataclasses.replace(first, trust=None)  # which changes nothing
     assert bare.digest == first.digest
-    assert register(surface=SURFACE, previous=bare, step=1).digest == second.digest
+    assert register(contacts=SURFACE, previous=bare, step=1).digest == second.digest
 
 
 @pytest.mark.parametrize(
@@ -65,9 +66,9 @@ def test_points_added_later_start_from_the_previous_result():
         {"free": POINT},
         {"occupied": POINT},
         {"known": POINT, "known_sdf": [0.02]},
-        {"surface": np.zeros((30, 3)), "free": np.zeros((50, 3))},
-        {"surface": [[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]},
-        {"free": np.full((1, 3), 50.0), "surface": POINT},
+        {"contacts": np.zeros((30, 3)), "free": np.zeros((50, 3))},
+        {"contacts": [[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]},
+        {"free": np.full((1, 3), 50.0), "contacts": POINT},
     ],
 )
 @pytest.mark.parametrize("preset", ["default", "reference"])
@@ -103,22 +104,22 @@ ASIDE = chsel.Workspace((0.38, 0, 0), (0.6, 0.3, 0.3))
     ("arguments", "code"),
     [
         ({"free": FREE}, "no_contact"),
-        ({"surface": SURFACE, "free": np.concatenate([FREE, SURFACE])}, "contacts_in_free_space"),
-        ({"surface": SURFACE, "workspace": ASIDE}, "contacts_outside"),
-        ({"surface": np.concatenate([SURFACE, [[3.0, 0, 0]]])}, "contacts_apart"),
-        ({"surface": SURFACE, "free": FREE + 5.0}, "contacts_far_from_free"),
-        ({"surface": SURFACE, "workspace": HALL}, "wide_workspace"),
-        ({"surface": np.repeat(SURFACE, 2, axis=0)}, "repeated"),
-        ({"surface": 400.0 * POSE[None, :3, 3]}, "far_away"),
-        ({"surface": SURFACE, "initial_set": STARTS}, "far_away"),
-        ({"surface": 3.0 * SURFACE}, "no_fit"),
-        ({"surface": SURFACE + NOISE, **ANCHORED}, "above_noise"),
+        ({"contacts": SURFACE, "free": np.concatenate([FREE, SURFACE])}, "contacts_in_free_space"),
+        ({"contacts": SURFACE, "workspace": ASIDE}, "contacts_outside"),
+        ({"contacts": np.concatenate([SURFACE, [[3.0, 0, 0]]])}, "contacts_apart"),
+        ({"contacts": SURFACE, "free": FREE + 5.0}, "contacts_far_from_free"),
+        ({"contacts": SURFACE, "workspace": HALL}, "wide_workspace"),
+        ({"contacts": np.repeat(SURFACE, 2, axis=0)}, "repeated"),
+        ({"contacts": 400.0 * POSE[None, :3, 3]}, "far_away"),
+        ({"contacts": SURFACE, "initial_set": STARTS}, "far_away"),
+        ({"contacts": 3.0 * SURFACE}, "no_fit"),
+        ({"contacts": SURFACE + NOISE, **ANCHORED}, "above_noise"),
     ],
 )
 def test_points_that_are_hardly_meant_give_a_warning_and_good_ones_none(arguments, code):
     assert code in warned(**arguments)
     room = chsel.Workspace.around(SURFACE, 0.1)
-    assert warned(surface=SURFACE, free=FREE, workspace=room) == []
+    assert warned(contacts=SURFACE, free=FREE, workspace=room) == []
 
 
 def test_points_far_off_all_poses_give_one_warning():
@@ -129,7 +130,7 @@ def test_points_far_off_all_poses_give_one_warning():
         warnings.simplefilter("default")
         for scale in (3.0, 3.1):
             surface = 3.0 * SURFACE + scale * NOISE
-            misfits.append(chsel.register(mesh, surface=surface, method="icp").trust.misfit)
+            misfits.append(chsel.register(mesh, contacts=surface, method="icp").trust.misfit)
     assert 10.0 < misfits[0] != misfits[1] > 10.0
     assert [warning.message.code for warning in caught] == ["above_noise"]
 
@@ -138,8 +139,8 @@ def test_points_far_off_all_poses_give_one_warning():
     ("arguments", "message"),
     [
         ({}, "no point was given; accepted: contacts, free"),
-        ({"surface": 1000.0 * SURFACE}, r"the object is 0\.1.* m: are they in mill"),
-        ({"contacts": POINT, "surface": POINT}, "contacts and surface are two names of the same"),
+        ({"contacts": 1000.0 * SURFACE}, r"the object is 0\.1.* m: are they in mill"),
+        ({"surface": POINT}, "surface was renamed; accepted: contacts="),
         ({"contacts": [[1e17, 0, 0]]}, r"contacts\[0\] has 1e\+17; accepted: up to 100000"),
         ({"free": [[1e8, 0, 0]]}, r"free\[0\] has 1e\+08; accepted: up to 100000"),
         ({"workspace": chsel.Workspace((0, 0, 0), (1e8, 1, 1))}, r"workspace\[1\] has 1e\+08"),
@@ -161,7 +162,7 @@ def test_points_far_off_all_poses_give_one_warning():
 )
 def test_mistakes_say_what_is_accepted(arguments, message):
     if arguments and not {"contacts", "surface", "free", "known"} & set(arguments):
-        arguments = {"surface": POINT, **arguments}
+        arguments = {"contacts": POINT, **arguments}
     with pytest.raises(chsel.ChselError, match=message) as caught:
         register(**arguments)
     assert "\n" not in str(caught.value)
@@ -169,17 +170,17 @@ def test_mistakes_say_what_is_accepted(arguments, message):
 
 
 def test_the_default_is_anchored_and_in_the_presets_of_the_paper_chsel():
-    default = chsel.register(BOX, surface=SURFACE[:5])
-    assert default.digest == chsel.register(BOX, surface=SURFACE[:5], method="anchored").digest
-    quick = {"surface": SURFACE[:5], "settings": QUICK, "preset": "paper"}
+    default = chsel.register(BOX, contacts=SURFACE[:5])
+    assert default.digest == chsel.register(BOX, contacts=SURFACE[:5], method="anchored").digest
+    quick = {"contacts": SURFACE[:5], "settings": QUICK, "preset": "paper"}
     assert chsel.register(BOX, **quick).digest == register(**quick).digest
 
 
 def test_own_starts_and_whole_settings_are_used():
     whole = preset_settings("gradient_descent", "default")
     starts = {"initial_set": np.tile(inverse(POSE), (4, 1, 1)), "method": "gradient_descent"}
-    found = register(surface=SURFACE, **starts, settings=None)
-    assert register(surface=SURFACE, **starts, settings=whole).digest == found.digest
+    found = register(contacts=SURFACE, **starts, settings=None)
+    assert register(contacts=SURFACE, **starts, settings=whole).digest == found.digest
     assert found.duplicate.tolist() == [False, True, True, True]
 
 
@@ -194,13 +195,11 @@ POLICY = chsel.build_policy("information")
 ONLINE = build_method("icp").online
 GRID, ROOM = chsel.SdfGrid.from_mesh(BOX, 0.02), chsel.Workspace((0, 0, 0), (1, 1, 1))
 KNOWN = chsel.KnownPoints(known=SURFACE)
-STEERED = (POLICY, GRID, ROOM, 0.01, ACTIONS, HAND)
 SDF = r"sdf is .*; accepted: .*chsel\.SdfGrid\.from_mesh"
 
 
-def other(arguments, place, value):
-    """The arguments with another one in a place."""
-    return (*arguments[:place], value, *arguments[place + 1 :])
+def loop(workspace=ROOM, **changes):
+    return chsel.Loop(GRID, workspace, **({"free_resolution": 0.01, "settings": ONLINE} | changes))
 
 
 @pytest.mark.parametrize(
@@ -210,26 +209,26 @@ def other(arguments, place, value):
         (chsel.RelaxedCost, (BOX, KNOWN), SDF),
         (chsel.RelaxedCost, (GRID, SURFACE), r"points is .*; accepted: chsel\.KnownPoints\("),
         (chsel.CompiledCost, (KNOWN, GRID), SDF),
-        (chsel.OnlineRegistration, (GRID, POINT, 0.01, ONLINE), "workspace is .*; accepted: chsel"),
-        (chsel.OnlineRegistration, (GRID, ROOM, 0.01, "icp"), "settings is 'icp'; accepted: met"),
-        (chsel.Steering, other(STEERED, 0, "grid"), r"policy is 'grid'; accepted: chsel\.build_p"),
-        (chsel.Steering, other(STEERED, 4, POSE), "actions is .*; accepted: chs"),
-        (chsel.Steering, other(STEERED, 5, BOX), "hand is .*; accepted: chs"),
+        (loop, (POINT,), "workspace is .*; accepted: chsel"),
+        (partial(loop, settings="icp"), (), "settings is 'icp'; accepted: met"),
+        (partial(loop, policy="grid"), (), r"policy is 'grid'; accepted: chsel\.build_p"),
+        (loop(policy=POLICY).offer, (POSE, HAND), "actions is .*; accepted: chs"),
+        (loop(policy=POLICY).offer, (ACTIONS, BOX), "hand is .*; accepted: chs"),
     ],
 )
 def test_values_of_another_class_are_refused(make, arguments, message):
-    points = {"surface": POINT} if make is chsel.register else {}
+    points = {"contacts": POINT} if make is chsel.register else {}
     with pytest.raises(chsel.ChselError, match=message) as caught:
         make(*arguments, **points)
     assert "\n" not in str(caught.value)
 
 
 def test_arrays_in_place_of_known_points_are_refused():
-    online = chsel.OnlineRegistration(GRID, ROOM, 0.01, ONLINE).steps(enumerate([SURFACE]))
+    probe = chsel.Probe(step=0, outcome="points", new_points=SURFACE)
     with pytest.raises(chsel.ChselError, match=r"points is .*; accepted: chsel\.KnownPoints"):
-        next(online)
+        loop().perceive(probe)
     with pytest.raises(chsel.ChselError, match=r"points is .*; accepted: chsel\.KnownPoints"):
-        chsel.Steering(*STEERED).decide(0, SURFACE, None, np.ones(1, dtype=bool))
+        loop(points=SURFACE)
 
 
 def test_the_examples_of_the_library_run(tmp_path):

@@ -45,12 +45,12 @@ def test_what_is_added_is_what_is_registered():
     session.add(contacts=CONTACTS[:5], contact=CONTACTS[5])
     first, given = session.register(), {"workspace": session.started.workspace, "seed": 3}
     assert session.register() is first
-    expected = chsel.register(BOX, surface=CONTACTS[:6], **given)
+    expected = chsel.register(BOX, contacts=CONTACTS[:6], **given)
     assert first.digest == expected.digest
     free = session.started.workspace.lower + 0.01 * np.array([[2, 3, 4], [2, 3, 5], [7, 0, 1]])
     others = {"occupied": TRUTH[None, :3, 3], "known": [[0.4, 0.1, 0.3]], "known_sdf": [0.1]}
     session.add(contacts=CONTACTS[6:], free=free + 0.004, **others)
-    given |= {"surface": CONTACTS, "free": free, "previous": expected, "step": 1}
+    given |= {"contacts": CONTACTS, "free": free, "previous": expected, "step": 1}
     assert session.register().digest == chsel.register(BOX, **others, **given).digest
 
 
@@ -149,7 +149,7 @@ def test_a_depth_image_and_two_touches_give_the_pose():
     depth, mask = np.minimum(box, floor).reshape(60, 80), np.isfinite(box).reshape(60, 80)
     session = chsel.Session(BOX)
     session.add(depth=depth, mask=mask, camera=CAMERA, world_from_camera=LOOK)
-    points = session.online.points
+    points = session.points
     seen, free = (apply(inverse(TRUTH), each) for each in (points.contacts, points.free))
     assert np.sum(np.abs(box_distance(seen, SIDES)) < 1e-9) == len(seen) > 20
     assert np.sum(box_distance(free, SIDES) > 0.0) == len(free) > 500
@@ -171,7 +171,7 @@ def test_a_hand_leaves_free_the_voxels_whose_centres_it_passed():
     centres = 0.01 * np.argwhere(np.ones((31, 21, 21)))
     away = np.abs((centres - places[:, None]) @ across)  # in the hand's frame
     passed = (away < 0.5 * hand.extents).all(axis=2).any(axis=0)
-    np.testing.assert_allclose(session.online.points.free, centres[passed], atol=1e-12)
+    np.testing.assert_allclose(session.points.free, centres[passed], atol=1e-12)
     assert passed.sum() == 19 * 5 * 3
 
 

@@ -44,7 +44,7 @@ def test_what_one_object_cannot_have_is_added_to_none():
         jitter = np.random.default_rng(0).uniform(0.0, 0.2, spread.shape)
         with pytest.raises(chsel.ChselError, match="millimetres"):
             which.add(contacts=spread + jitter)
-        counts = [len(session.online.points.known) for session in which.sessions.values()]
+        counts = [len(session.points.known) for session in which.sessions.values()]
         assert counts == [12, 12]
         assert {session.step for session in which.sessions.values()} == {0}
 
@@ -55,7 +55,7 @@ def test_objects_of_other_sizes_are_compared_by_the_same_points():
     near = np.concatenate([contacts, contacts + np.array([0.0, 0.0, 0.0025])])
     with chsel.WhichObject({"large": large, "small": small}) as which:
         which.add(contacts=near)
-        digests = {session.online.points.digest for session in which.sessions.values()}
+        digests = {session.points.digest for session in which.sessions.values()}
     assert len(digests) == 1
 
 

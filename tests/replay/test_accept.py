@@ -12,13 +12,13 @@ import trimesh
 
 from chsel.events import Believed, ListRecorder, Measured, ProblemPosed, RigDescribed, SensorImage
 from chsel.plausible.symmetry import object_symmetry
-from chsel.problem import online_registration as online
+from chsel.problem import initial_sets
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import axis_angle, compose, inverse
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from chsel.registration import register_recorded
+from chsel.session.recording import register_recorded
 from replay.__main__ import main
 from replay.mcap.reader import read_recording
 from replay.verbs.accept import best_pose_moves, write_accepted
@@ -36,8 +36,8 @@ def stored(tmp_path):
 @pytest.fixture
 def other_code(monkeypatch):
     """Code that draws the noise of E_0 otherwise."""
-    drawn = online.normals
-    monkeypatch.setattr(online, "normals", lambda stream, shape: -drawn(stream, shape))
+    drawn = initial_sets.normals
+    monkeypatch.setattr(initial_sets, "normals", lambda stream, shape: -drawn(stream, shape))
 
 
 def test_nothing_changes_where_all_bits_are_equal(stored, capsys):
@@ -154,8 +154,14 @@ def test_recorded_errors_are_modulo_the_symmetries_of_the_object_at_its_centre()
         0.01,
         StreamKey(0, 1),
     )
-    recorder, symmetry = ListRecorder(), object_symmetry(BOX)
-    registered = register_recorded(ProblemPosed(1, problem), Fixed(), recorder, TRUTH, symmetry)
+    recorder = ListRecorder()
+    registered = register_recorded(
+        ProblemPosed(1, problem),
+        Fixed(),
+        recorder=recorder,
+        world_from_object=TRUTH,
+        symmetry=object_symmetry(BOX),
+    )
     (measured,) = (event for event in recorder.events if isinstance(event, Measured))
     assert measured.values == registered.numbers
     assert measured.values["best_position_error"] == pytest.approx(0.03, abs=1e-9)

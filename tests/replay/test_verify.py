@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from chsel import events
 from chsel.events import HypothesesFound, Measured, SessionStarted, Traced
+from chsel.session.loop import Loop
 from replay.__main__ import main
 from replay.comparing.differences import is_close, ulps
 from replay.comparing.verification import DIFFERS, EQUAL, NO_RESULT, verified_files, verify
 from replay.mcap.reader import read_recording
 from tests.replay.conftest import changed, nth
-from tests.tools.small_recordings import registered_session
+from tests.tools.small_recordings import pushing_session, registered_session, steered_session
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 REPLAYS = REPOSITORY / "tests" / "replays"
@@ -132,6 +134,67 @@ def test_other_settings_than_those_that_gave_the_result_are_found(descent, write
     found = verdicts(write(changed(descent, descent[0], config=config)))
     assert {verdict.outcome for verdict in found} == {DIFFERS}
     assert "which does not come about" in found[0].stage
+
+
+@pytest.fixture
+def pushing(write):
+    return write(pushing_session())
+
+
+def outcomes(path):
+    return [(verdict.step, verdict.outcome, verdict.stage) for verdict in verdicts(path)]
+
+
+def test_pushes_and_the_first_registration_are_computed_and_equal(pushing):
+    recording = read_recording(pushing)
+    assert recording.start.start == events.Start(contacts=6)
+    assert recording.start.moves == 0.02
+    assert len(recording.problem(2).pushes.directions) == 3
+    assert outcomes(pushing) == [(1, EQUAL, ""), (2, EQUAL, "")]
+
+
+def test_other_pushes_by_the_same_touches_differ(pushing, monkeypatch):
+    monkeypatch.setattr(events, "_LEAST_SIDEWAYS", 2.0)  # no touch pushes
+    assert outcomes(pushing) == [(1, DIFFERS, "pushes"), (2, DIFFERS, "pushes")]
+
+
+@pytest.mark.parametrize(
+    ("contacts", "expected"),
+    [
+        (1, [(0, DIFFERS, "a registration, which is not recorded"), (1, EQUAL), (2, EQUAL)]),
+        (11, [(1, DIFFERS, "making E_0, which does not come about"), (2, EQUAL)]),
+    ],
+)
+def test_another_first_registration_differs(contacts, expected, pushing, monkeypatch):
+    def enough(loop):
+        return len(loop.state.points.contacts) >= contacts
+
+    monkeypatch.setattr(Loop, "enough", property(enough))
+    found = outcomes(pushing)
+    assert [(*one, "") if len(one) == 2 else one for one in expected] == found
+
+
+def test_a_registration_that_was_not_to_be_is_explained(pushing, monkeypatch, capsys):
+    monkeypatch.setattr(Loop, "enough", property(lambda loop: loop.state.step > 1))
+    assert main(["verify", str(pushing)]) == 1
+    assert "now it ends: this step does not register" in capsys.readouterr().out
+
+
+def test_where_a_program_asks_for_registrations_their_steps_are_not_compared(write, monkeypatch):
+    events_of = pushing_session()
+    path = write(changed(events_of, events_of[0], start=None))
+    monkeypatch.setattr(Loop, "enough", property(lambda loop: loop.state.step > 1))
+    assert outcomes(path) == [(1, EQUAL, ""), (2, EQUAL, "")]
+
+
+@pytest.mark.parametrize("limit", [0.0, 1e9])
+def test_another_limit_of_surprises_differs(limit, write, monkeypatch):
+    """The recorded limit is 1e9, and 0 makes a surprise of every touch; and the other way round."""
+    path = write(steered_session(surprise={"limit": 1e9 - limit, "larger": 2}))
+    assert {outcome for _, outcome, _ in outcomes(path)} == {EQUAL}
+    surprised = property(lambda loop: loop.policy is not None and loop.state.surprise > limit)
+    monkeypatch.setattr(Loop, "_is_surprised", surprised)
+    assert (0, DIFFERS, "making E_0") in outcomes(path)
 
 
 def test_several_files_and_processes_give_the_same_verdicts(tmp_path, capsys):

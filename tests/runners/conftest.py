@@ -18,4 +18,4 @@ def compiled_kernels():
     ball = chsel.SdfGrid(np.full(3, -0.04), 0.01, radius - 0.025, gradients)
     with warnings.catch_warnings(action="ignore", category=chsel.PointsWarning):  # of a poor fit
         for method in METHODS:
-            chsel.register(ball, surface=[[0.025, 0, 0]], free=[[0.1, 0, 0]], method=method)
+            chsel.register(ball, contacts=[[0.025, 0, 0]], free=[[0.1, 0, 0]], method=method)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import pytest
 from hydra._internal.hydra import Hydra
 
-from chsel.registration import one_line
+from chsel.session.recording import one_line
 from runners.evaluation import tasks
 
 

@@ -4,7 +4,7 @@ import pytest
 from chsel.events import Measured, Probe
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import object_symmetry
-from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, inverse, rotation_angle
 from chsel.problem.sdf_grid import mesh_sdf
@@ -71,9 +71,8 @@ def test_recorded_problems_with_pushes_give_the_recorded_bits(recording):
     verdicts = list(verify(recording))
     assert {verdict.outcome for verdict in verdicts} == {EQUAL}
     session = RecordedSession(RecordedSettings(str(recording.path)))
-    online = session.online(OnlineSettings(), recording.seed)
-    posed = [step.problem for step in online.steps(session.perceived()) if step.problem]
-    assert [p.pushes.digest for p in posed] == [
+    loop = session.loop(OnlineSettings(), seed=recording.seed)
+    assert [problem.pushes.digest for problem in loop.problems(session.probes())] == [
         recording.problem(step).pushes.digest for step in recording.steps
     ]
     np.testing.assert_array_equal(

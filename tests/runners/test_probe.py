@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 import chsel
 from chsel.errors import MeshError
 from chsel.events import Believed, Logged, Measured
-from chsel.methods import trust_by
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import object_symmetry
-from replay.comparing.beliefs import Beliefs
+from chsel.session.judging import trust_by
+from replay.comparing.beliefs import BeliefSequence
 from replay.comparing.choices import recorded_method
 from replay.mcap.reader import read_recording
 from runners import probe
@@ -95,7 +95,7 @@ def test_recorded_beliefs_follow_from_the_recorded_results(finished):
     recording = read_recording(finished[0] / "recording.mcap")
     told = [event for event in recording.events() if isinstance(event, Believed)]
     assert [event.step for event in told] == [0, 1, 2]
-    beliefs = Beliefs(recording)
+    beliefs = BeliefSequence(recording)
     for event in told:
         problem, found = recording.problem(event.step), recording.hypotheses(event.step)
         again = beliefs.after(problem, found).event(event.step)

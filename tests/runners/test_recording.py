@@ -7,7 +7,7 @@ from chsel.errors import RecordingError
 from chsel.events import ListRecorder, Measured, Traced
 from chsel.numerics.arrays import digest
 from chsel.problem.poses import apply, axis_angle, compose
-from chsel.registration import StepObserver
+from chsel.session.recording import StepObserver
 from replay.mcap.reader import read_recording
 from runners.objects.loader import load_model
 from runners.probe import main

@@ -22,14 +22,14 @@ def test_contacts_and_depth_come_into_the_world_and_poses_out():
     for x, y, z in ((0.0, -0.02, 0.47), (0.03, 0.05, 0.47), (0.05, 0.01, 0.5), (0.01, 0.1, 0.51)):
         bridge.contact(Message(header="camera", point=Message(x=x, y=y, z=z)))
     expected = [[0.0, -0.03, 0.02], [0.03, -0.03, -0.05], [0.05, 0.0, -0.01], [0.01, 0.01, -0.1]]
-    assert np.allclose(session.online.points.known, expected)
+    assert np.allclose(session.points.known, expected)
 
     depth = np.zeros((4, 6), ">u2")  # in rows of 12 bytes, of which 10 count
     depth[:, :5], depth[:, 5] = 400, 7
     image = {"width": 5, "height": 4, "step": 12, "encoding": "16UC1", "data": depth.tobytes()}
     info = Message(k=[10.0, 0.0, 2.0, 0.0, 10.0, 1.5, 0.0, 0.0, 1.0])
     bridge.look(Message(header="camera", is_bigendian=1, **image), info)
-    free = session.online.points.free
+    free = session.points.free
     assert len(free) > 10
     assert -0.5 <= free[:, 1].min() < free[:, 1].max() < -0.1
     assert (np.abs(free[:, 0]) <= 0.25 * (free[:, 1] + 0.5) + 0.01).all()  # within its view

@@ -77,7 +77,7 @@ ball = chsel.SdfGrid(np.full(3, -0.04), 0.01, radius - 0.025, gradients)
 free = 0.02 * np.argwhere(np.ones((6, 6, 6))) - 0.05
 free = free[(free**2).sum(axis=1) > 0.035**2]
 for method in sys.argv[1:]:
-    chsel.register(ball, surface=0.025 * np.eye(3), free=free, method=method)
+    chsel.register(ball, contacts=0.025 * np.eye(3), free=free, method=method)
 print([name for name in sys.argv[0].split() if name in sys.modules])
 """
 

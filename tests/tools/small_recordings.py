@@ -7,8 +7,6 @@ import numpy as np
 import trimesh
 
 from chsel.events import (
-    ActionsOffered,
-    Decided,
     ListRecorder,
     Logged,
     Probe,
@@ -17,16 +15,16 @@ from chsel.events import (
     SensorImage,
     SessionEnded,
     SessionStarted,
+    Start,
 )
 from chsel.methods import build_method
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.policies import build_policy
-from chsel.policies.steering import Steering
-from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import settings_mapping
-from chsel.registration import register_recorded, symmetry_for_errors
+from chsel.session.loop import Loop
+from chsel.session.recording import register_recorded, symmetry_for_errors
 from replay.mcap.writer import McapRecorder
 
 _SIDES = (0.1, 0.06, 0.04)
@@ -37,6 +35,7 @@ _DESCENT = {
     "online": {"hypotheses": 4},
     "cost": {"penetration_tolerance": -0.005},
 }
+_SIDEWAYS = np.eye(4)[None, [2, 0, 1, 3]].repeat(2, axis=0)  # poses whose z axis is horizontal
 _SEARCH = {"emitter": {"iterations": 12}, "archive": {"bins": 6}}
 METHODS = {"gradient_descent": _DESCENT, "chsel": _DESCENT | _SEARCH}
 
@@ -58,40 +57,53 @@ def steered_session(name="gradient_descent", *, policy="information", seed=3, **
     return _session(name, policy, seed, changes)
 
 
-def _session(name, policy, seed, changes=None):
-    method, random = build_method(name, METHODS[name]), np.random.default_rng(seed)
-    start, recorder = _start(random, name, method, seed), ListRecorder()
-    given = (start.sdf, start.workspace, start.free_resolution)
-    online = OnlineRegistration(*given, method.online, seed=seed, points=start.initial_points)
-    found, steering = None, None
-    if policy is not None:
-        steers = build_policy(policy, STEERED | changes)
-        group = {"name": policy, **settings_mapping(steers.settings)}
+def pushing_session(name="gradient_descent", *, seed=3):
+    """Events of three touches that push a box, of which the last two register by themselves."""
+    start = {"start": Start(contacts=6), "moves": 0.02}
+    return _session(name, None, seed, probes=3, path=_SIDEWAYS, **start)
+
+
+def _session(name, policy_name, seed, changes=None, *, probes=2, path=None, **of_start):
+    method = build_method(name, METHODS[name])
+    random = np.random.default_rng(seed)
+    start = dataclasses.replace(_start(random, name, method, seed), **of_start)
+    recorder = ListRecorder()
+    policy = None
+    if policy_name is not None:
+        policy = build_policy(policy_name, STEERED | changes)
+        group = {"name": policy_name, **settings_mapping(policy.settings)}
         start = dataclasses.replace(start, config={**start.config, "policy": group})
-        hand = HandShape.of(trimesh.creation.box((0.05, 0.04, 0.03)))
-        offered = ActionsOffered(-1, _actions(), hand)
-        steering = Steering(steers, *given, offered.actions, hand, seed=seed)
-        available = np.ones(len(offered.actions), dtype=bool)
+    loop = Loop.of_session(start, method.online, policy=policy, seed=seed)
     recorder.record(start)
-    if steering is not None:
+    if policy is not None:
+        hand = HandShape.of(trimesh.creation.box((0.05, 0.04, 0.03)))
+        offered = loop.offer(_actions(), hand)
         recorder.record(offered)
-    for step in range(2 if steering is None else 4):
-        if steering is not None:
-            choice = steering.decide(step, online.points, found, available)
-            recorder.record(Decided(step - 1, *choice, steering.surprise))
-            if choice.decision.stop:
+        available = np.ones(len(offered.actions), dtype=bool)
+    for step in range(probes if policy is None else 4):
+        if policy is not None:
+            decided = loop.decide(available)
+            recorder.record(decided)
+            loop.follow(decided)
+            if decided.decision.stop:
                 break
-            available[choice.decision.chosen] = False
+            available[decided.decision.chosen] = False
         probe = _probe(random, step)
+        if path is not None:
+            probe = dataclasses.replace(probe, gripper_path=path)
         recorder.record(probe)
-        online.points = online.points.merged(probe.new_points)
-        if steering is not None and steering.felt(probe.contacts):
-            online.start_afresh(steers.settings.surprise.larger)
-        posed, symmetry = ProblemPosed(step, online.pose(step)), symmetry_for_errors(start)
+        loop.perceive(probe)
+        if not loop.enough:
+            continue
         found = register_recorded(
-            posed, method, recorder, start.world_from_object, symmetry, snapshot_interval=6
+            ProblemPosed(step, loop.problem()),
+            method,
+            recorder=recorder,
+            world_from_object=start.world_from_object,
+            symmetry=symmetry_for_errors(start),
+            snapshot_interval=6,
         ).hypotheses
-        online.remember(found)
+        loop.remember(found)
         recorder.record(Logged(step, "info", f"probe {step}: contact"))
         last = step
     recorder.record(SessionEnded(last, "finished"))

@@ -13,8 +13,8 @@ from chsel.methods.anchored.fitting import fitted, twists_of
 from chsel.methods.anchored.walking import Chains, stride_of, walked
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
+from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.noise import NoiseModel, noise_model
-from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import Poses, compose, product, random_rotations, rotated
 from chsel.problem.pushes import Pushes

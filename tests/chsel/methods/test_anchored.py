@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from chsel.errors import ChselError
-from chsel.methods import build_method, trust_by
+from chsel.methods import build_method
 from chsel.methods.anchor_sampling import AnchorSampler, most_informative_first
 from chsel.methods.anchored.anchored import Anchored, AnchoredSettings, Effort, Search, distinct
 from chsel.methods.anchored.energy import Energy
@@ -25,6 +25,7 @@ from chsel.problem.streams import StreamKey
 from chsel.problem.subset import surface_descriptors
 from chsel.problem.surface import outline_distances_to
 from chsel.problem.trust import trust_in
+from chsel.session.judging import trust_by
 from tests.chsel.methods.scene import (
     GRID,
     ODD,

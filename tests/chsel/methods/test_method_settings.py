@@ -17,7 +17,7 @@ from chsel.methods.cvo import CvoSettings
 from chsel.methods.gradient_descent import DescentSettings
 from chsel.methods.icp import Icp, IcpSettings
 from chsel.methods.medial_constraint import CmaEsSettings
-from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.settings import PRESETS, NamedChoices, settings_mapping
 from tests.chsel.methods.scene import posed
 

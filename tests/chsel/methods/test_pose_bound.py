@@ -7,11 +7,12 @@ import pytest
 import trimesh
 
 import chsel
-from chsel.methods import build_method, trust_by
+from chsel.methods import build_method
 from chsel.methods.anchored.pose_bound import pose_bound
 from chsel.problem.poses import Poses, axis_angle, compose, inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import StreamKey
+from chsel.session.judging import trust_by
 from tests.chsel.samples import hypotheses_at
 
 DEGREE = math.radians(1.0)

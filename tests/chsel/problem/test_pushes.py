@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 import chsel
-from chsel import KnownPoints, OnlineRegistration, Pushes, trust_in
+from chsel import KnownPoints, Loop, Probe, Pushes, trust_in
 from chsel.errors import PointsError, SettingError
-from chsel.events import Probe
-from chsel.methods import trust_by
 from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
-from chsel.problem.online_registration import OnlineSettings
-from chsel.problem.poses import Poses, inverse
+from chsel.problem.initial_sets import OnlineSettings
+from chsel.problem.poses import Poses, compose, inverse
 from chsel.problem.surface import outline_distances_to
+from chsel.session.judging import trust_by
 from tests.chsel.methods.scene import GRID, MESH, SIDE, STANDING, WORKSPACE, known_points
 
 X, Y, DIAGONAL = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.6, 0.8, 0.0]
@@ -42,24 +42,43 @@ def test_points_move_by_the_sum_of_the_pushes_after_them():
     ],
 )
 def test_pushes_that_cannot_be_are_an_error(changes, error, text):
-    loop, _ = online(0.01)
+    loop, _ = pushed(0.01)
     given = {"directions": [X], "before": [[0, 0, 1]], "largest": 0.01} | changes
     with pytest.raises(error, match=text):
-        replace(loop.pose(0), points=KnownPoints(known=[X]), pushes=Pushes(**given))
+        replace(loop.problem(), points=KnownPoints(known=[X]), pushes=Pushes(**given))
 
 
-def online(push_distance):
+def loop_of(**options):
+    return Loop(GRID, WORKSPACE, free_resolution=SIDE, settings=SETTINGS, **options)
+
+
+def touch(step, points, direction):
+    """A touch of a hand on its way in a horizontal direction."""
+    pose = np.eye(4)
+    pose[:3, 2] = direction
+    return Probe(
+        step=step,
+        outcome="contact",
+        new_points=points,
+        gripper_path=pose[None],
+        contacts=points.known,
+        contact_normals=np.zeros((len(points.known), 3)),
+    )
+
+
+def pushed(moves):
     """What is known after 12 pushes, each of which moves the L by MOVES, and where it is then."""
-    loop = OnlineRegistration(GRID, WORKSPACE, SIDE, SETTINGS, push_distance=push_distance)
+    loop = loop_of(moves=moves)
     contacts = known_points(STANDING, 12).known
     random, pose = np.random.default_rng(3), STANDING.copy()
-    for contact in contacts:
+    for step, contact in enumerate(contacts):
         angle = random.uniform(-np.pi, np.pi)
         direction = np.array([np.cos(angle), np.sin(angle), 0.0])
         since = pose[:3, 3] - STANDING[:3, 3]
-        loop.perceive(KnownPoints(known=[contact + since]), direction)
+        loop.perceive(touch(step, KnownPoints(known=[contact + since]), direction))
         pose[:3, 3] += MOVES * direction
-    loop.perceive(KnownPoints(free=known_points(pose, 1).free))
+    free = KnownPoints(free=known_points(pose, 1).free)
+    loop.perceive(Probe(step=0, outcome="free", new_points=free))
     return loop, pose
 
 
@@ -69,8 +88,9 @@ def distance_to(truth, hypotheses):
 
 
 def test_the_distance_of_pushes_is_found_and_the_pose_is_that_of_the_end():
-    loop, truth = online(0.01)
-    method, problem = Anchored(AnchoredSettings(size="small")), loop.pose(0)
+    loop, truth = pushed(0.01)
+    method = Anchored(AnchoredSettings(size="small"))
+    problem = loop.problem()
     found = method.register(problem)
     assert found.push_distance == pytest.approx(MOVES, abs=0.001)
     assert distance_to(truth, found) < 0.002
@@ -88,18 +108,20 @@ def test_a_session_that_was_not_told_notices_that_touches_move_the_object(moves)
     if moves == 0.0:  # contacts that are off otherwise
         contacts = contacts + random.normal(0.0, 0.003, contacts.shape)
     settings = AnchoredSettings(size="small")
+    hand = trimesh.creation.box((0.002, 0.002, 0.002))
     with chsel.Session(
         MESH, resolution=0.01, workspace=WORKSPACE, method=Anchored(settings)
     ) as session:
         since = np.zeros(3)
-        for step, contact in enumerate(contacts):
+        for contact in contacts:
             angle = random.uniform(-np.pi, np.pi)
-            pose = np.eye(4)
-            pose[:3, 2] = np.cos(angle), np.sin(angle), 0.0  # the hand's way
-            new = KnownPoints(known=[contact + since])
-            session.observe(Probe(step, "contact", new, pose[None], new.known, np.zeros((1, 3))))
-            since += moves * pose[:3, 2]
-        session.register_step()
+            way = np.array([np.cos(angle), np.sin(angle), 0.0])
+            across = np.array([-way[1], way[0], 0.0])
+            turn = np.stack([across, [0.0, 0.0, 1.0], way], axis=1)
+            path = compose(np.stack([turn] * 2), np.full((2, 3), 0.5))  # far from the object
+            session.add(hand=hand, path=path, contact=contact + since)
+            since += moves * way
+        session.register()
         assert session.trust.misfit > 2.0
         assert session.check_moved() == pytest.approx(moves, abs=0.001)
         codes = {warning.code: warning.text for warning in session.warnings}
@@ -109,8 +131,9 @@ def test_a_session_that_was_not_told_notices_that_touches_move_the_object(moves)
 
 def test_after_a_push_of_unknown_distance_no_pose_is_determined():
     points, method = known_points(STANDING, 12), Anchored(AnchoredSettings(size="small"))
-    loop = OnlineRegistration(GRID, WORKSPACE, SIDE, SETTINGS, points=points)
-    problem = loop.pose(0)
+    loop = loop_of()
+    loop.perceive(Probe(step=0, outcome="points", new_points=points))
+    problem = loop.problem()
     found, before = method.register(problem), [[len(points.free), 0, len(points.known)]]
     for largest, verdict in ((0.001, "determined"), (0.03, "wide")):
         pushed = replace(problem, pushes=Pushes([DIAGONAL], before, largest))
@@ -119,8 +142,8 @@ def test_after_a_push_of_unknown_distance_no_pose_is_determined():
 
 
 def test_an_object_that_stands_has_the_same_result_as_if_nobody_spoke_of_pushes():
-    loop, _ = online(0.01)
-    problem = loop.pose(0)
+    loop, _ = pushed(0.01)
+    problem = loop.problem()
     where = KnownPoints(known=known_points(STANDING, 12).known)
     told = replace(
         problem,
@@ -138,11 +161,12 @@ def test_something_else_than_pushes_is_an_error():
     with pytest.raises(
         SettingError, match=r"accepted: chsel.Pushes\(directions, before, largest\)"
     ):
-        chsel.register(GRID, surface=[X], pushes=[X])
+        chsel.register(GRID, contacts=[X], pushes=[X])
 
 
 def test_pushes_count_where_the_object_may_move():
-    told, silent = online(0.0)[0], OnlineRegistration(GRID, WORKSPACE, SIDE, SETTINGS)
-    silent.perceive(told.points)
-    assert told.pose(3).pushes is None
-    assert told.pose(3).digest == silent.pose(3).digest
+    stated, _ = pushed(0.0)
+    silent = loop_of()
+    silent.perceive(Probe(step=0, outcome="points", new_points=stated.state.points))
+    assert stated.problem().pushes is None
+    assert stated.problem().digest == silent.problem().digest

@@ -61,8 +61,8 @@ def test_a_far_background_is_free_up_to_the_end_of_the_workspace(tmp_path, backg
     with chsel.Session(BOX, record=path) as session:
         session.add(depth=depths(background), **SEEN)
     wall = added(depth=depths(5.0), **SEEN)
-    assert session.online.points.digest == wall.online.points.digest
-    free = apply(inverse(TRUTH), session.online.points.free)
+    assert session.points.digest == wall.points.digest
+    free = apply(inverse(TRUTH), session.points.free)
     assert (box_distance(free, SIDES) > 0.0).all()
     assert len(free) > 10_000
     (image,) = read_recording(path).sensor_images([0])
@@ -85,19 +85,19 @@ def test_depths_in_a_large_workspace_are_recorded_up_to_its_end(tmp_path):
 
 def test_masked_depths_are_no_measurement():
     masked = np.ma.masked_array(depths(0.9), mask=~MASK)
-    expected = added(depth=depths(0.0), **SEEN).online.points
-    assert added(depth=masked, **SEEN).online.points.digest == expected.digest
+    expected = added(depth=depths(0.0), **SEEN).points
+    assert added(depth=masked, **SEEN).points.digest == expected.digest
 
 
 def test_the_same_image_again_adds_no_point_on_the_object_and_a_touch_does():
     session = added(depth=depths(0.9), **SEEN)
-    points = session.online.points
+    points = session.points
     for noise in (0.0, 0.0002):
         off = np.random.default_rng(0).normal(0.0, noise, MASK.shape) if noise else 0.0
         session.add(depth=depths(0.9) + off, **SEEN)
-    assert len(session.online.points.contacts) <= 1.1 * len(points.contacts)
+    assert len(session.points.contacts) <= 1.1 * len(points.contacts)
     session.add(contacts=points.contacts[:1] + 0.001)
-    assert session.online.points.contacts[-1].tolist() == (points.contacts[0] + 0.001).tolist()
+    assert session.points.contacts[-1].tolist() == (points.contacts[0] + 0.001).tolist()
 
 
 IMAGE = {"depth": np.ones((60, 80)), "camera": MATRIX, "world_from_camera": LOOK}
@@ -130,7 +130,7 @@ REFUSED = (
     ({"contacts": CONTACTS.astype(str)}, "contacts is not an array of numbers"),
     ({"contacts": CONTACTS.astype(str).astype(object)}, "contacts is not an array of numbers"),
     ({"contacts": CONTACTS + 0.1j}, "contacts is not an array of numbers"),
-    ({"surface": CONTACTS}, "surface is the name in chsel.register; accepted: contacts="),
+    ({"surface": CONTACTS}, "surface was renamed; accepted: contacts="),
     ({"hand": trimesh.Trimesh(), "path": TRUTH[None]}, "hand has no faces; accepted: a closed"),
     (
         {"hand": trimesh.Trimesh(HAND.vertices, HAND.faces[:1]), "path": TRUTH[None]},
@@ -146,7 +146,7 @@ def test_what_cannot_be_meant_is_one_line_and_the_session_goes_on(what, text):
         refused(text, session.add, **what)
         session.add(contacts=CONTACTS)
     assert session.step == 1
-    assert len(session.online.points.contacts) == len(CONTACTS)
+    assert len(session.points.contacts) == len(CONTACTS)
 
 
 def test_a_matrix_is_the_camera_and_a_swapped_centre_is_a_warning():
@@ -160,8 +160,8 @@ def test_a_matrix_is_the_camera_and_a_swapped_centre_is_a_warning():
     ):
         session = added(camera=matrix, **ahead)
         assert [warning.code for warning in session.warnings] == expected
-    by_matrix = added(depth=depths(0.9), **SEEN | {"camera": MATRIX}).online.points
-    assert by_matrix.digest == added(depth=depths(0.9), **SEEN).online.points.digest
+    by_matrix = added(depth=depths(0.9), **SEEN | {"camera": MATRIX}).points
+    assert by_matrix.digest == added(depth=depths(0.9), **SEEN).points.digest
 
 
 def test_poses_points_and_rooms_in_millimetres_are_a_warning():
@@ -196,7 +196,7 @@ def free_of(hand):
     """The voxels that a hand makes free where it stands."""
     session = chsel.Session(BOX, workspace=ROOM)
     session.add(hand=hand, path=compose(np.eye(3), [0.15, 0.1, 0.1])[None])
-    return session.online.points.free.tolist()
+    return session.points.free.tolist()
 
 
 def test_a_hand_whose_faces_look_inward_is_as_solid_as_another():
@@ -226,16 +226,15 @@ def test_a_place_that_is_touched_again_counts_once():
     """A sensor that sends a held contact a hundred times, with a jitter of 0.2 mm."""
     jitter = np.random.default_rng(0).normal(0.0, 0.0002, (100, 3))
     session = added(contacts=CONTACTS[:14])
-    first = session.online.points
+    first = session.points
     for off in jitter:
         session.add(contact=CONTACTS[3] + off, occupied=None)
-    assert session.online.points.digest == first.digest
+    assert session.points.digest == first.digest
     assert [warning.code for warning in session.warnings] == ["repeated"]
     assert session.warnings[0].text.startswith("1 of 1 points are within 3 mm of an earlier one")
     assert session.step == 100
-    assert session.outcome == "contact"
     at_once = added(contacts=np.concatenate([CONTACTS[:14], CONTACTS[3] + jitter]))
-    assert at_once.online.points.digest == first.digest
+    assert at_once.points.digest == first.digest
     with pytest.warns(chsel.PointsWarning, match="100 of 114 points"):
         found = chsel.register(BOX, contacts=np.concatenate([CONTACTS[:14], CONTACTS[3] + jitter]))
     assert found.trust.redundancy == 8
@@ -249,4 +248,4 @@ def test_after_a_touch_that_moves_the_object_a_place_counts_again():
         session = chsel.Session(BOX, moves=moves)
         for _ in range(3):
             session.add(**touch)
-        assert len(session.online.points.contacts) == count
+        assert len(session.points.contacts) == count

@@ -25,7 +25,7 @@ from chsel.events import (
     Traced,
 )
 from chsel.problem.sdf_grid import object_grid
-from chsel.session import Session
+from chsel.session.session import Session
 from replay.__main__ import main
 from replay.comparing.verification import EQUAL, NO_RESULT, verify
 from replay.mcap.reader import read_recording

@@ -312,7 +312,7 @@ def test_the_real_frame_registers_near_its_published_pose(real_directory):
     assert len(points.known) > 400
     assert len(points.free) > 10_000
     hypotheses = chsel.register(
-        mesh, surface=points.known, free=points.free, workspace=found.workspace, seed=1
+        mesh, contacts=points.known, free=points.free, workspace=found.workspace, seed=1
     )
     best = hypotheses.object_from_world[int(np.argmin(hypotheses.cost))]
     assert np.abs(mesh_sdf(mesh, apply(best, points.known))[0]).mean() < 0.004

@@ -5,22 +5,25 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from chsel.events import Probe
 from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
 from chsel.methods.method import Method
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.compiler import cache_directory
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.policies.policy import Policy, StopSettings
-from chsel.policies.steering import Steering
-from chsel.problem.online_registration import OnlineRegistration
+from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.trust import trust_in
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
+from chsel.session.loop import Loop
 
 _RADIUS = 0.025
 _MOST = 30  # iterations, hypotheses and so on: one compiles as much as a thousand do
@@ -47,12 +50,17 @@ def warm_up(method: Method) -> None:
     with suppress(Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about a ball that nobody has asked for
         method = type(method)(_brief(method.settings))  # type: ignore[call-arg]
-        online = OnlineRegistration(_ball(), _WORKSPACE, 0.02, method.online)
-        for step in online.steps(enumerate((touched, others)), method.register):
-            assert step.hypotheses is not None
-            assert step.problem is not None
-            result_numbers(step.hypotheses, step.problem, np.eye(4), None)
-            Anchored(_brief(AnchoredSettings())).minima(step.problem)  # see trust_by
+        loop = Loop(_ball(), _WORKSPACE, free_resolution=0.02, settings=method.online)
+        probes = [
+            Probe(step=step, outcome="points", new_points=points)
+            for step, points in enumerate((touched, others))
+        ]
+        for problem in loop.problems(probes):
+            hypotheses = method.register(problem)
+            hypotheses = replace(hypotheses, trust=trust_in(problem, hypotheses))
+            result_numbers(hypotheses, problem, np.eye(4), None)
+            Anchored(_brief(AnchoredSettings())).minima(problem)  # see trust_by
+            loop.remember(hypotheses)
 
 
 def warm_up_sensing() -> None:
@@ -72,12 +80,21 @@ def warm_up_policy(policy: Policy) -> None:
     world_from_hand = np.eye(4)[None].repeat(2, axis=0)
     world_from_hand[:, :3, 3] = [[0.0, 0.0, -0.05], [0.01, 0.0, -0.05]]
     with suppress(Exception):  # as above
-        settings = dataclasses.replace(_brief(policy.settings), stop=StopSettings(0.0, 0.0))
+        settings = replace(_brief(policy.settings), stop=StopSettings(0.0, 0.0))
         policy = type(policy)(settings)  # type: ignore[call-arg]
         actions = Actions(world_from_hand, np.full(2, 0.1))
-        steering = Steering(policy, _ball(), _WORKSPACE, 0.02, actions, hand)
-        steering.decide(0, KnownPoints(free=np.full((1, 3), 0.05)), None, np.ones(2, dtype=bool))
-        steering.felt(np.zeros((1, 3)))
+        loop = Loop(
+            _ball(),
+            _WORKSPACE,
+            free_resolution=0.02,
+            settings=OnlineSettings(),
+            policy=policy,
+            points=KnownPoints(free=np.full((1, 3), 0.05)),
+        )
+        loop.offer(actions, hand)
+        loop.follow(loop.decide(np.ones(2, dtype=bool)))
+        touch = np.zeros((1, 3))
+        loop.perceive(Probe(step=0, outcome="contact", new_points=KnownPoints(), contacts=touch))
 
 
 def _ball() -> SdfGrid:
@@ -88,11 +105,11 @@ def _ball() -> SdfGrid:
 
 
 def _brief(settings: Any) -> Any:
-    """The settings with every count at most _MOST."""
+    """Return the settings with every count at most _MOST."""
     values = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
     changes: dict[str, Any] = {
         name: _brief(value) if dataclasses.is_dataclass(value) else min(value, _MOST)
         for name, value in values.items()
         if dataclasses.is_dataclass(value) or type(value) is int
     }
-    return dataclasses.replace(settings, **changes)
+    return replace(settings, **changes)

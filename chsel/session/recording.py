@@ -1,4 +1,4 @@
-"""Runs registrations, and announces them to recorders."""
+"""What a session records: registrations with all they give, and recorders that fail."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from chsel.errors import ChselError
+from chsel.belief import PoseBelief
+from chsel.errors import ChselError, RecordingError
 from chsel.events import (
     Event,
     HypothesesFound,
@@ -19,25 +20,29 @@ from chsel.events import (
     SnapshotTaken,
     Traced,
 )
-from chsel.methods import trust_by
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray, digest
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
+from chsel.session.judging import trust_by
+
+NO_RESULT = "no result: "
+"""How the line begins that says why a step has no result."""
 
 
 @dataclass(frozen=True, eq=False)
 class Registered:
-    """What a registration gave: its result with trust, numbers, wall-clock seconds by stage."""
+    """The result of a registration, with what follows from it."""
 
-    hypotheses: Hypotheses
-    numbers: Mapping[str, float]
-    seconds: Mapping[str, float]
+    hypotheses: Hypotheses  # with trust
+    numbers: Mapping[str, float]  # as recordings have them, see `Measured`
+    seconds: Mapping[str, float]  # wall-clock times, by stage
+    belief: PoseBelief | None = None  # after it, where that was wanted
 
     @property
     def total_seconds(self) -> float:
-        """Of all stages."""
+        """Wall-clock seconds of all stages."""
         return sum(self.seconds.values())
 
 
@@ -81,17 +86,19 @@ class StepObserver:
 def register_recorded(
     posed: ProblemPosed,
     method: Method,
+    *,
     recorder: Recorder,
     world_from_object: FloatArray | None,
     symmetry: ObjectSymmetry | None,
-    *,
     snapshot_interval: int = 0,
     show: Callable[[str, int, int], None] = lambda *_: None,
+    believe: Callable[[Hypotheses], PoseBelief] | None = None,
 ) -> Registered:
-    """Register a problem, and record it with all that the registration gives.
+    """Register a problem, record it with all that the registration gives, and return this.
 
     world_from_object (4, 4): the true pose, where known. symmetry: of the object, for the errors to
-    the true pose; None: without errors. show: gets stage, iteration and total.
+    the true pose; None: without errors. show: gets stage, iteration and total. believe: returns the
+    belief after a result with a pose, where that is wanted.
     """
     recorder.record(posed)
     observer = StepObserver(recorder, posed.step, snapshot_interval, show)
@@ -102,28 +109,83 @@ def register_recorded(
     trust = trust_by(method, posed.problem, hypotheses)
     truth = None if symmetry is None else world_from_object
     numbers = result_numbers(hypotheses, posed.problem, truth, symmetry, trust)
-    results: tuple[Event, ...] = (
+    results: list[Event] = [
         HypothesesFound(posed.step, hypotheses),
         Measured(posed.step, numbers),
-    )
-    for event in results:  # both or none
+    ]
+    hypotheses = replace(hypotheses, trust=trust)
+    belief = None
+    if believe is not None and trust is not None:
+        belief = believe(hypotheses)
+        results.append(belief.event(posed.step))
+    for event in results:  # all or none
         recorder.check(event)
     for event in results:
         recorder.record(event)
-    return Registered(replace(hypotheses, trust=trust), numbers, seconds)
+    return Registered(hypotheses, numbers, seconds=seconds, belief=belief)
+
+
+class SessionRecorder(Recorder):
+    """Hands events to another recorder, each checked as soon as it comes.
+
+    Where that recorder fails, as on a full disk, the next `flush` or `close` raises its error,
+    once. What follows is not recorded, so that the session can go on.
+    """
+
+    def __init__(self, recorder: Recorder, advice: str = "") -> None:
+        """advice: ends the text of that error."""
+        self._recorder, self._advice = recorder, advice
+        self._error: RecordingError | None = None  # that is not raised yet
+        self._failed = False
+
+    def check(self, event: Event) -> None:
+        """Raise RecordingError for an event that cannot be recorded."""
+        if not self._failed:
+            self._recorder.check(event)
+
+    def record(self, event: Event) -> None:
+        """Record an event. Raise as `check` does, with nothing recorded."""
+        self.check(event)
+        if not self._failed:
+            self._attempt(lambda: self._recorder.record(event))
+
+    def flush(self) -> None:
+        """Let all events so far survive, or raise why they do not."""
+        if not self._failed:
+            self._attempt(self._recorder.flush)
+        self._raise()
+
+    def close(self) -> None:
+        """Finish what was written, or raise why it is not finished."""
+        reported = self._failed and self._error is None
+        self._attempt(self._recorder.close)
+        if reported:
+            self._error = None
+        self._raise()
+
+    def _attempt(self, call: Callable[[], None]) -> None:
+        try:
+            call()
+        except RecordingError as error:
+            self._error, self._failed = self._error or error, True
+
+    def _raise(self) -> None:
+        error, self._error = self._error, None
+        if error is not None:
+            raise RecordingError(f"{error}{self._advice}") from error
 
 
 def symmetry_for_errors(start: SessionStarted) -> ObjectSymmetry | None:
-    """The symmetries of a session's object; None if no true pose is known to need them."""
+    """Return the symmetries of a session's object; None if no true pose is known to need them."""
     return None if start.world_from_object is None else object_symmetry(start.mesh)
 
 
 def one_line(error: BaseException) -> str:
-    """The text of an error, with its class if it is none of ours."""
+    """Return the text of an error, with its class if it is not one of `chsel.errors`."""
     text = printable(" ".join(str(error).split()))
     return text if isinstance(error, ChselError) else f"{type(error).__name__}: {text}"
 
 
 def printable(text: str) -> str:
-    """A text whose control characters are shown by their codes, as recordings hold none."""
+    """Return a text with control characters as their codes, as recordings hold none."""
     return "".join(c if c.isprintable() or c in "\n\t" else repr(c)[1:-1] for c in text)

@@ -1,0 +1,90 @@
+"""Whether a result stands: beside what a search for rivals finds, and for pushes not expected."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
+from chsel.methods.anchored.pose_bound import pose_bound
+from chsel.methods.method import Method
+from chsel.problem.pushes import Pushes
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
+from chsel.problem.trust import (
+    DETERMINED,
+    MANY_CONTACTS,
+    SENSOR_NOISE,
+    WIDE,
+    explaining,
+    fits_elsewhere,
+    has_pose,
+    trust_in,
+)
+
+_CLOSE = 2.0  # noise levels: a misfit that needs no explanation
+
+
+def noise_of(method: Method) -> float:
+    """Return the noise of known points by a method's settings, metres, or SENSOR_NOISE."""
+    settings = getattr(method, "settings", None)
+    return settings.noise if isinstance(settings, AnchoredSettings) else SENSOR_NOISE
+
+
+def trust_by(method: Method, problem: RegistrationProblem, hypotheses: Hypotheses) -> Trust | None:
+    """Return how far to trust what a method found, by the noise in its settings.
+
+    None without a pose. A single mode has to stand beside what a search for other poses finds,
+    among them turns under which the object looks nearly alike, and poses that leave out one of few
+    contacts. Of many contacts, `anchored` has done this search itself. Where pushes may have moved
+    the object, it has to stand also beside what is found for other distances of them. How far the
+    pose may be off is in `centre_within` and `turn_within`, by `pose_bound`.
+    """
+    if not has_pose(hypotheses):
+        return None
+    noise = noise_of(method)
+    carried = problem.carried(hypotheses.push_distance)
+    rivals = None
+    trust = trust_in(carried, hypotheses, noise)
+    searched = isinstance(method, Anchored) and len(carried.points.known) >= MANY_CONTACTS
+    if trust.verdict == DETERMINED and not searched:
+        rivals = _search(noise).minima(carried)
+        trust = trust_in(carried, hypotheses, noise, rivals)
+    if trust.verdict == DETERMINED and _fits_other_pushes(problem, hypotheses, noise):
+        reason = "pushes of another length fit elsewhere"
+        trust = replace(trust, verdict=WIDE, modes=0, reason=reason)
+    poses, _ = explaining(carried, hypotheses, noise, rivals)
+    centre, turn = pose_bound(carried.sdf, poses)
+    return replace(trust, centre_within=centre, turn_within=turn)
+
+
+def unexpected_push(
+    method: Method, problem: RegistrationProblem, trust: Trust | None, pushes: Pushes | None
+) -> float:
+    """Return by how much each touch seems to have moved the object, metres; or 0.
+
+    problem, trust: of a result by points of an object that stands still. pushes: that may have
+    moved it. Where the result leaves contacts off its best pose, points are registered once more
+    as if the pushes had moved them.
+    """
+    if problem.pushes is not None or pushes is None:
+        return 0.0
+    if trust is None or trust.misfit <= _CLOSE:
+        return 0.0
+    return _search(noise_of(method)).register(replace(problem, pushes=pushes)).push_distance
+
+
+def _fits_other_pushes(problem: RegistrationProblem, hypotheses: Hypotheses, noise: float) -> bool:
+    """Whether other poses explain the points as well where pushes have another distance."""
+    if problem.pushes is None:
+        return False
+    carried = problem.carried(hypotheses.push_distance)
+    search = _search(noise)
+    for distance in problem.pushes.distances:
+        other = problem.carried(distance)
+        if fits_elsewhere(carried, hypotheses, other, search.minima(other), noise):
+            return True
+    return False
+
+
+def _search(noise: float) -> Anchored:
+    """Return a search for poses that explain the points, at a noise, metres."""
+    return Anchored(AnchoredSettings(noise=noise))

@@ -1,0 +1,359 @@
+"""From what a robot's program says that was perceived to probes: checked, in one form."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from chsel.errors import InputWarning, MeshError, PointsError, PoseError, require_instance
+from chsel.events import Probe, SensorImage, SessionStarted
+from chsel.numerics.arrays import BoolArray, FloatArray, evenly_spaced, frozen
+from chsel.problem.points import (
+    FARTHEST_PLACE,
+    KnownPoints,
+    Workspace,
+    away_from,
+    check_places,
+    check_points,
+    distinct_points,
+    same_place,
+    workspace_around,
+    world_known_points,
+    world_points,
+)
+from chsel.problem.poses import apply, inverse, nearest_rigid
+from chsel.sensing.depth_camera import DepthLook, PinholeCamera, depth_look, outside_of
+from chsel.sensing.free_space import FreeGrid, interior_lattice, poses_between
+
+if TYPE_CHECKING:
+    import trimesh
+
+_ACROSS = 15.0  # to a diameter: points on the object that a depth image gives
+_MOST_WHOLE = 20  # m: of depths in whole numbers
+_MOST_SHOWN = 200  # poses of a path, in recordings
+_UNIT = 1e-4  # m: of recorded depths, up to 6.5 m; of others a multiple of it
+_ROUNDING = 1e-9  # of a number of units
+_FINEST_DEPTHS = 6.5535  # m: up to which 16 bits hold tenths of a millimetre
+
+
+class Perception(NamedTuple):
+    """Points, a moving hand and a depth image that became known at once; world, metres."""
+
+    contacts: FloatArray  # (C, 3)
+    free: FloatArray  # (N, 3)
+    others: KnownPoints  # occupied points, and known ones that are not contacts
+    path: FloatArray  # (P, 4, 4): world_from_hand
+    hand: FloatArray  # (M, 3): points inside the hand, in its frame
+    swept: FloatArray  # (Q, 4, 4): poses world_from_hand on the path, close together
+    look: DepthLook | None
+    spacing: float  # of points that the look gives, metres
+
+    @property
+    def touching(self) -> KnownPoints:
+        """All points but the free ones and those of the look."""
+        return KnownPoints(known=self.contacts).merged(self.others)
+
+    def check(self, diameter: float, workspace: Workspace | None) -> list[InputWarning]:
+        """Return warnings about places in another unit, and a camera with a swapped centre."""
+        camera = np.zeros((0, 3)) if self.look is None else self.look.pose[None, :3, 3]
+        places = {
+            "the hand's path": self.path[:, :3, 3],
+            "world_from_camera": camera,
+            "the nearest known point": np.concatenate([self.free, self.touching.all_points()]),
+        }
+        found: list[InputWarning] = []
+        for name, points in places.items():
+            found += check_places(name, points, diameter, workspace)
+        return found if self.look is None else found + self.look.camera.check_centre()
+
+
+class Prepared(NamedTuple):
+    """Input that was checked, and what a session becomes by it."""
+
+    started: SessionStarted  # with the workspace
+    grid: FreeGrid
+    perception: Perception
+    probe: Probe  # but for the points that become free
+    image: SensorImage | None
+    touching: KnownPoints  # without places that were measured before
+    seen: FloatArray  # (M, 3): points on the object in the image, without such places
+    warnings: list[InputWarning]
+
+
+class Intake:
+    """Turns what a program adds, step by step, into events of a session."""
+
+    diameter: float
+    """Of the object, metres, which the density of points on it depends on."""
+
+    def __init__(self, started: SessionStarted, grid: FreeGrid | None, *, moves: float) -> None:
+        """Take nothing yet.
+
+        grid: over the workspace; None where that follows from the first points, and `started` has
+        any. moves: metres that a touch moves the object at most.
+        """
+        self.diameter = started.sdf.diameter
+        self._started = started
+        self._moves = moves
+        self._grid = grid  # free space of what was taken
+        self._since = KnownPoints()  # on the object, since it was pushed last
+        self._seen = np.zeros((0, 3))  # the same of depth images
+
+    def prepare(self, points: KnownPoints, *, step: int, **what: Any) -> Prepared:
+        """Check input, with nothing taken yet; arguments as `perceived` takes them.
+
+        points: all that are known before. step: of the probe. Raise ChselError for malformed input,
+        and for points that cannot be the object's.
+        """
+        started = self._started
+        spacing = started.free_resolution
+        perception = perceived(**what, diameter=self.diameter, spacing=spacing)
+        look = perception.look
+        touching, found = distinct_points(
+            perception.touching, self._since, same_place(self.diameter)
+        )
+        seen = np.zeros((0, 3))
+        if look is not None:
+            seen = look.surface[away_from(look.surface, self._seen, perception.spacing)]
+        on_object = touching.merged(KnownPoints(known=seen))
+        grid = self._grid
+        given_workspace = None
+        if grid is not None:
+            given_workspace = started.workspace
+            merged = points.merged(on_object)
+            check_points(merged, started.sdf.diameter, spacing, given_workspace)
+        else:
+            check_points(on_object, started.sdf.diameter, spacing)
+            workspace = workspace_around(_first_places(perception, on_object), started.sdf)
+            grid = FreeGrid(workspace, spacing)
+            started = replace(started, workspace=workspace)
+        outcome = "free"
+        if len(perception.contacts):
+            outcome = "contact"
+        elif perception.others.count:
+            outcome = "points"
+        probe = Probe(
+            step=step,
+            outcome="points" if look is not None else outcome,
+            new_points=on_object,
+            gripper_path=perception.path[evenly_spaced(len(perception.path), _MOST_SHOWN)],
+            contacts=perception.contacts,
+            contact_normals=np.zeros_like(perception.contacts),
+        )
+        image = None
+        if look is not None:
+            farthest = farthest_depth(look, started.workspace)
+            look = look._replace(ends=np.minimum(look.ends, farthest))
+            image = _image(step, look, farthest)
+        return Prepared(
+            started=started,
+            grid=grid,
+            perception=perception._replace(look=look),
+            probe=probe,
+            image=image,
+            touching=touching,
+            seen=seen,
+            warnings=[*found, *perception.check(started.sdf.diameter, given_workspace)],
+        )
+
+    def take(self, prepared: Prepared) -> list[SensorImage | Probe]:
+        """Let what was prepared become known; return the events that say so."""
+        self._started = prepared.started
+        grid = prepared.grid
+        self._grid = grid
+        perception = prepared.perception
+        look = perception.look
+        grid.at(perception.free)
+        grid.at(perception.hand, poses=perception.swept)
+        surface = np.zeros((0, 3))
+        if look is not None:
+            surface = look.surface
+            grid.from_depth(look.ends, look.camera, look.pose, look.rays, fraction=1.0)
+        free = outside_of(surface, grid.new(), self._started.free_resolution)
+        known = KnownPoints(free=free).merged(prepared.probe.new_points)
+        probe = replace(prepared.probe, new_points=known)
+        self._seen = np.concatenate([self._seen, prepared.seen])
+        self._since = self._since.merged(prepared.touching)
+        if self._moves and probe.push is not None:  # what was known has moved with the object
+            self._grid = FreeGrid(self._started.workspace, self._started.free_resolution)
+            self._seen = np.zeros((0, 3))
+            self._since = KnownPoints()
+        return [probe] if prepared.image is None else [prepared.image, probe]
+
+
+def known_points(
+    *,
+    contacts: Any = None,
+    free: Any = None,
+    occupied: Any = None,
+    known: Any = None,
+    known_sdf: Any = None,
+) -> KnownPoints:
+    """Return points of all classes together, contacts first of the known; None means no points.
+
+    Arguments as of `chsel.register`. Raise PointsError for malformed ones.
+    """
+    touched = KnownPoints(known=world_points("contacts", contacts))
+    others = world_known_points(free=free, occupied=occupied, known=known, known_sdf=known_sdf)
+    return touched.merged(others)
+
+
+def refuse_surface(surface: Any) -> None:
+    """Raise PointsError for points by a name that is no longer accepted."""
+    if surface is not None:
+        raise PointsError("surface was renamed; accepted: contacts=")
+
+
+def perceived(
+    *,
+    contacts: Any = None,
+    free: Any = None,
+    occupied: Any = None,
+    known: Any = None,
+    known_sdf: Any = None,
+    hand: Any = None,
+    path: Any = None,
+    contact: Any = None,
+    depth: Any = None,
+    camera: Any = None,
+    world_from_camera: Any = None,
+    mask: Any = None,
+    surface: Any = None,
+    diameter: float,
+    spacing: float,
+) -> Perception:
+    """Return the arguments of `Session.add`, checked.
+
+    diameter: of the object, metres. spacing: side of free voxels, metres.
+    Raise ChselError for malformed input, see there.
+    """
+    refuse_surface(surface)
+    if all(each is None for each in (contacts, free, occupied, known, path, contact, depth)):
+        raise PointsError("nothing was added; accepted: points, a path or a depth image")
+    if (hand is None) is not (path is None):
+        raise PointsError("hand and path belong together; accepted: both or none")
+    image = [each is not None for each in (depth, camera, world_from_camera)]
+    if any(image) is not all(image) or (mask is not None and depth is None):
+        raise PointsError(
+            "depth, camera and world_from_camera belong together, with or without mask; "
+            "accepted: all of them or none"
+        )
+    touched = known_points(contacts=contacts).known
+    if contact is not None:
+        contact = frozen("contact", contact, (3,), most=FARTHEST_PLACE)
+        touched = np.concatenate([touched, contact[None]])
+    free_points = known_points(free=free).free
+    others = known_points(occupied=occupied, known=known, known_sdf=known_sdf)
+    nodes = np.zeros((0, 3))
+    poses = swept = np.zeros((0, 4, 4))
+    if path is not None:
+        poses = frozen("path", path, (None, 4, 4), error=PoseError, most=FARTHEST_PLACE)
+        poses = nearest_rigid("path", poses)
+        bodies = hand_bodies(hand)
+        nodes = interior_lattice(bodies, 0.5 * spacing)
+        if len(nodes) == 0:
+            raise MeshError("hand has no inside; accepted: a closed mesh, metres")
+        corners = np.concatenate([body.vertices for body in bodies])
+        radius = float(np.sqrt((corners**2).sum(axis=1)).max())
+        swept = poses_between(poses, step=0.5 * spacing, radius=radius)
+    look = None
+    side = diameter / _ACROSS
+    if depth is not None:
+        depth = _depths(depth)
+        if not isinstance(camera, PinholeCamera):
+            height, width = depth.shape
+            camera = PinholeCamera.of_matrix(camera, width, height)
+        mask = None if mask is None else _mask(mask)
+        look = depth_look(depth, camera, world_from_camera, mask, before=spacing, side=side)
+    return Perception(
+        contacts=touched,
+        free=free_points,
+        others=others,
+        path=poses,
+        hand=nodes,
+        swept=swept,
+        look=look,
+        spacing=side,
+    )
+
+
+def hand_bodies(hand: Any) -> list[trimesh.Trimesh]:
+    """Return the bodies of a hand, turned outward. Raise MeshError for a mesh without faces."""
+    import trimesh
+
+    require_instance("hand", hand, trimesh.Trimesh, "a mesh such as chsel.load_mesh(path)")
+    if len(hand.faces) == 0:
+        raise MeshError("hand has no faces; accepted: a closed mesh, metres")
+    vertices = frozen("hand vertices", hand.vertices, (None, 3), error=MeshError)
+    merged = trimesh.Trimesh(vertices, hand.faces)  # vertices at one place are one
+    bodies = list(merged.split(only_watertight=False)) or [merged]
+    for body in bodies:
+        if body.is_watertight and body.is_winding_consistent and body.volume < 0.0:
+            body.invert()
+    return bodies
+
+
+def farthest_depth(look: DepthLook, workspace: Workspace) -> float:
+    """Return the depth (m) beyond which the rays of an image have left the workspace."""
+    lower, upper = workspace.bounds
+    corners = np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, lower, upper)
+    deepest = float(apply(inverse(look.pose), corners)[:, 2].max())
+    return max(deepest, _FINEST_DEPTHS)
+
+
+def _depths(given: Any) -> FloatArray:
+    """Return a depth image (H, W), metres; NaN where it is masked."""
+    if np.ma.isMaskedArray(given):
+        given = np.ma.asarray(given, np.float64).filled(np.nan)
+    depth = frozen("depth", given, (None, None), finite=False)
+    whole = np.asarray(given).dtype.kind in "iu"
+    if whole and (depth > _MOST_WHOLE).any() and (depth[depth > 0.0] <= _MOST_WHOLE).any():
+        raise PointsError(
+            f"depth has whole numbers up to {depth.max():g}: millimetres? accepted: metres"
+        )
+    return depth
+
+
+def _mask(given: Any) -> BoolArray:
+    """Return flags (H, W) of pixels, from numbers of which one marks those of the object."""
+    mask = frozen("mask", given, (None, None))
+    values = np.unique(mask[mask != 0.0])
+    if len(values) > 1:
+        raise PointsError(
+            f"mask has {len(values)} values other than 0; accepted: true for the object's pixels"
+        )
+    return np.asarray(mask != 0.0)
+
+
+def _first_places(perception: Perception, on_object: KnownPoints) -> KnownPoints:
+    """Return what a workspace follows from: points on the object, else where it is not."""
+    if on_object.count:
+        return on_object
+    passed = KnownPoints(free=np.concatenate([perception.free, perception.path[:, :3, 3]]))
+    if passed.count == 0:
+        raise PointsError(
+            "nothing says where the object can be; accepted: chsel.Session(..., "
+            "workspace=...), or first points, a path or a mask"
+        )
+    return passed
+
+
+def _image(step: int, look: DepthLook, farthest: float) -> SensorImage:
+    """Return a depth image as recordings have it: without depths beyond the farthest, metres."""
+    depth = np.where(look.depth > farthest, 0.0, look.depth)
+    unit = _UNIT * np.ceil(max(float(depth.max()) / (65535 * _UNIT) - _ROUNDING, 1.0))
+    values = np.rint(depth / unit).astype(np.uint16)
+    camera = look.camera
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    return SensorImage(
+        step=step,
+        sensor="camera",
+        kind="depth",
+        values=values,
+        unit=unit,
+        mask=look.rays,
+        intrinsics=intrinsics,
+        world_from_camera=look.pose,
+    )
