@@ -47,6 +47,9 @@ _PD = "PD in mm²"
 _RUN, BASELINE = "What was run", "All methods beside the baseline"
 _TRUTH_HELD = "Whether sets hold the truth"
 _FAULTS = "Faults, and whether sets hold the truth"
+_MEDIAL = "The Medial Constraint with and without quality diversity"
+_CVO = "CVO with and without free space"
+_OF_A_FEW = "Plausible diversity as in the sections on all methods, of these methods alone."
 _BUSY = "on one thread, after a warm-up. Several workers on one machine slow each other down."
 _LAST_HALF = (
     "Numbers are pooled over trials (a configuration with a seed) and over the steps of the last "
@@ -56,6 +59,7 @@ _TEXTS = {  # of sections, by title
     _RUN: "A trial is a configuration with a seed. What has failed is nowhere counted as a number.",
     "True poses": "The true pose of a recorded session is the one of least evaluation cost, after "
     "the last probe, near a pose that a person set (of a simulated log: its rounded truth).",
+    _TRUTH_HELD: "Of methods that say which poses they cannot tell from their best one.",
     _FAULTS: "Plausible sets are of the contacts without faults, "
     "see docs/faults.md. All other sections pool the levels. Distances are between surfaces.",
     BASELINE: "Over every step of every trial and draw. A ratio is PD by that of {baseline} at the "
@@ -65,6 +69,8 @@ _TEXTS = {  # of sections, by title
     "an object. Lower is better. First and last steps are of some trials only.",
     "Plausible diversity by object and method": f"{_LAST_HALF} Boxes span the quartiles, lines "
     "across are medians; whiskers reach to the last numbers within 1.5 boxes. Lower is better.",
+    _MEDIAL: _OF_A_FEW,
+    _CVO: _OF_A_FEW,
     "Time per registration": f"Wall-clock time of the registration alone {_BUSY}",
     "Plausible diversity and cost over QD iterations": "What a method would give if its search "
     "ended there, medians and quartiles over trials and steps, of which each has one start.",
@@ -89,11 +95,8 @@ _TEXTS = {  # of sections, by title
     f"registration before it, and of both together, {_BUSY}",
 }
 _FEW_METHODS = {  # name of the picture: title of the section, methods
-    "medial": (
-        "The Medial Constraint with and without quality diversity",
-        ("chsel", "medial_constraint", "medial_constraint_cma_me"),
-    ),
-    "cvo": ("CVO with and without free space", ("icp", "cvo", "cvo_no_free_space")),
+    "medial": (_MEDIAL, ("chsel", "medial_constraint", "medial_constraint_cma_me")),
+    "cvo": (_CVO, ("icp", "cvo", "cvo_no_free_space")),
 }
 _FAULTY_COLUMNS = {  # title and unit of the table, factor
     "nearest_hypothesis": ("From the true pose to the nearest hypothesis, mm", _MM),
@@ -120,16 +123,20 @@ Part = tuple[str, Sequence[Table], Picture | None]  # title, tables, picture of 
 
 
 def sections_of(evaluation: Evaluation, baseline: str | None = None) -> list[Section]:
-    """What there is something to show of, and what was run.
+    """Return the sections of a report: what was run, and those that have a table with rows.
 
-    Raises SettingError for a baseline without PD, or of policies without a session.
+    Raise SettingError for a baseline without PD, or of policies without a session.
     """
     on = _on_policies if evaluation.experiment["policies"] else _on_methods
     parts, numbers = on(evaluation, baseline)
-    return [
-        Section(title, _TEXTS.get(title, "").format(**numbers), tables, picture)
+    every = [
+        Section(title, _TEXTS[title].format(**numbers), tables, picture)
         for title, tables, picture in parts
-        if title == _RUN or any(table.rows for table in tables)
+    ]
+    return [
+        section
+        for section in every
+        if section.title == _RUN or any(table.rows for table in section.tables)
     ]
 
 
