@@ -1,0 +1,74 @@
+"""`python -m tests.tools.changed`: the tests of the rooms that the working tree changes.
+
+Changed is what differs from the last commit, and files that git does not know yet. A file
+`chsel/problem/points.py` is tested by the files in `tests/chsel/problem/`, those named after it
+first; a page is tested by `tests/docs/`. Tests that have not begun after 15 seconds are skipped.
+"""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("chsel", "replay", "runners")
+SECONDS = 15.0
+
+
+def changed_files():
+    """Return the paths of all changed files, relative to the repository."""
+    listings = ["diff --name-only -z HEAD", "ls-files --others --exclude-standard -z"]
+    texts = [subprocess.check_output(["git", *each.split()], cwd=ROOT) for each in listings]
+    return [Path(name) for text in texts for name in text.decode().split("\0") if name]
+
+
+def tests_of(file):
+    """Return the test files of a changed file's room, in the order in which they matter."""
+    top = file.parts[0]
+    if top == "docs" or file.suffix == ".md":
+        return sorted((ROOT / "tests" / "docs").glob("test_*.py"))
+    if top == "tests":
+        folder = ROOT / file.parent
+    elif top in PACKAGES:
+        folder = ROOT / "tests" / file.parent
+    else:
+        return []
+    words = {file.stem.removeprefix("test_")}
+    while not folder.is_dir():  # a folder of the product whose tests lie with those of its parent
+        words.add(folder.name)
+        folder = folder.parent
+    files = sorted(folder.glob("test_*.py"))
+    return sorted(files, key=lambda test: not any(word in test.stem for word in words))
+
+
+class Ordered:
+    """A plugin of pytest that takes test files in a given order until their time is over."""
+
+    def __init__(self, files):
+        self.files = files
+        self.end = time.monotonic() + SECONDS
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items):
+        items.sort(key=lambda item: self.files.index(item.path))
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtest_setup(self):
+        if time.monotonic() > self.end:
+            pytest.skip(f"not begun after {SECONDS:g} s; make test runs it")
+
+
+def main():
+    """Run the tests of all changed files."""
+    rooms = [tests_of(file) for file in changed_files()]
+    files = list(dict.fromkeys(test for room in rooms for test in room))
+    if not files:
+        print("no room with tests is changed")
+        return 0
+    return pytest.main(["-x", "-rs", *map(str, files)], plugins=[Ordered(files)])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
