@@ -1,4 +1,4 @@
-"""A program that knows docs/format*.md, the package mcap and numpy reads recordings as ours does."""
+"""A program that knows docs/format*.md, mcap and numpy reads recordings as ours does."""
 
 import hashlib
 import re
