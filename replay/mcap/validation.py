@@ -1,7 +1,8 @@
 """What the table of messages accepts, and in which order the events of a session can come.
 
-The writer lets nothing else into a recording, and the reader nothing else out: a recording can come
-from anybody.
+The writer lets nothing else into a recording, and the reader nothing else out: a file of another
+program, or a damaged one, is an error and not a wrong result. Files made to exhaust time or memory
+are not defended against, but for the limit of `file.py` on what a chunk may unpack to.
 """
 
 from __future__ import annotations

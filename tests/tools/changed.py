@@ -25,9 +25,8 @@ def changed_files():
 
 
 def tests_of(file):
-    """Return the test files of a changed file's room, in the order in which they matter."""
-    top = file.parts[0]
-    words = {file.stem.removeprefix("test_")}
+    """Return the test files of a changed file's room: those named after it, and the others."""
+    top, words = file.parts[0], {file.stem.removeprefix("test_")}
     if top in ("docs", "examples") or file.suffix == ".md":
         folder = ROOT / "tests" / "docs"
     elif top == "conf":
@@ -37,12 +36,17 @@ def tests_of(file):
     elif top in ("chsel", "replay", "runners"):
         folder = ROOT / "tests" / file.parent
     else:
-        return []
-    while not folder.is_dir():  # a folder of the product whose tests lie with those of its parent
+        return [], []
+    while not folder.is_dir():  # the tests of some folders lie with those of their parent
         words.add(folder.name)
         folder = folder.parent
     files = sorted(folder.glob("test_*.py"))
-    return sorted(files, key=lambda test: not any(word in test.stem for word in words))
+    named = [
+        test
+        for test in files
+        if any(word in test.stem or test.stem.removeprefix("test_") in word for word in words)
+    ]
+    return named, [test for test in files if test not in named]
 
 
 class Ordered:
@@ -66,7 +70,8 @@ class Ordered:
 def main():
     """Run the tests of all changed files."""
     rooms = [tests_of(file) for file in changed_files()]
-    files = list(dict.fromkeys(test for room in rooms for test in room))
+    named, others = ([test for room in rooms for test in room[n]] for n in (0, 1))
+    files = list(dict.fromkeys([*named, *others]))
     if not files:
         print("no room with tests is changed")
         return 0
