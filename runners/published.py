@@ -102,9 +102,9 @@ def main(config: DictConfig) -> None:
 
 
 def found_trials(config: PublishedConfig) -> list[tuple[Trial, Path]]:
-    """Trials with a finished session and its recording, seed by seed.
+    """Return trials with a finished session and its recording, seed by seed.
 
-    Raises SettingError if the settings name none.
+    Raise SettingError if the settings name none.
     """
     folder = Path(config.dir or "").expanduser()
     experiment = read_experiment(folder)
@@ -153,7 +153,7 @@ class PackageSession:
         return self.sets.with_suffix(".about.json")
 
     def failures(self) -> Mapping[str, str] | None:
-        """Why steps have no set; None if the sets are not there, or of another session or version.
+        """Return why steps have no set; None if the sets are missing or of another session.
 
         A file that cannot be read is made again.
         """
@@ -164,7 +164,7 @@ class PackageSession:
         return None
 
     def register(self) -> Iterator[int]:
-        """Yields each step when the package is done with it; the files are there at the end."""
+        """Yield each step when the package is done with it; the files exist at the end."""
         session = RecordedSession(RecordedSettings(str(self.session), 0, 0))
         arrays: dict[str, Any] = {}
         about: dict[str, Any] = {"failed": {}, "cpu_seconds": {}, "free_points": {}}
@@ -201,7 +201,7 @@ class PackageSession:
 def registered(
     package: PublishedPackage, problem: RegistrationProblem, mesh: trimesh.Trimesh
 ) -> tuple[Hypotheses, Mapping[str, Any]]:
-    """What the package finds with its own settings, best first, and its whole answer."""
+    """Return the hypotheses of the package with its own settings, best first, and its answer."""
     package.load(problem, mesh.bounds)
     # It draws from generators of its own, of one number that follows from ours.
     seed = int(problem.key.stream(Purpose.EMITTER).integers(2**32))

@@ -101,7 +101,7 @@ class RawFile:
         fault: Fault,
         progress: Callable[[int], None] = lambda done: None,
     ) -> Iterator[RawMessage]:
-        """The messages on topics (None: all). fault: called with each damage. progress: with bytes.
+        """Yield the messages on topics (None: all). fault and progress: called with damage, bytes.
 
         Without an index, nothing is read behind the first damage.
         """
@@ -129,7 +129,7 @@ class RawFile:
         fault: Fault,
         progress: Callable[[int], None],
     ) -> Iterator[RawMessage]:
-        """A chunk is read once no message before it can be missing."""
+        """Yield messages by time: a chunk is read once no message before it can be missing."""
         waiting: list[tuple[int, int, int, RawMessage]] = []
         done = 0
         for chunk in self._chunks:
@@ -204,5 +204,5 @@ class RawFile:
 
 
 def _is_wanted(channel: Channel | None, topics: frozenset[str] | None) -> bool:
-    """Whether a channel is on one of the topics, or may be; None: every topic is wanted."""
+    """Return whether a channel is on one of the topics, or may be; None: every topic is wanted."""
     return topics is None or channel is None or channel.topic in topics

@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def _summary(module: Path) -> str:
-    """The first line of a module, which is read, not imported: that would take seconds."""
+    """Return the first line of a module, which is read, not imported: that would take seconds."""
     return (ast.get_docstring(ast.parse(module.read_bytes())) or "").partition("\n")[0]
 
 

@@ -41,7 +41,7 @@ from replay.mcap.writer import McapRecorder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Files, and whether to ask."""
+    """Add files, and whether to ask."""
     parser.add_argument("files", nargs="+", metavar="FILE", help="recordings, or folders of them")
     parser.add_argument("--yes", action="store_true", help="do not ask")
 
@@ -81,7 +81,7 @@ def _accept(path: Path, *, ask: bool) -> int:
 
 
 def _table(title: str, changes: Sequence[ResultChange]) -> Table:
-    """A row for each registration whose result changes."""
+    """Return a row for each registration whose result changes."""
     table = plain_table(title, texts=["step", "up to", "best pose moves", *_NUMBERS])
     for change in changes:
         position, rotation = change.moved
@@ -123,7 +123,7 @@ def write_accepted(recording: Recording, path: Path) -> list[ResultChange]:
     """Write the recording with today's results to a new file; how each result differs.
 
     Registrations follow from today's results; decisions are of the recorded probes, whatever they
-    choose. Raises RecordingError if the recording was recovered with losses, behind which E_0 and
+    choose. Raise RecordingError if the recording was recovered with losses, behind which E_0 and
     E_l do not follow from what is left. A recorded belief is that of today's result, too.
     """
     changes: list[ResultChange] = []
@@ -189,7 +189,7 @@ def _measured(events: Sequence[Event]) -> dict[str, float]:
 def best_pose_moves(
     recorded: Hypotheses, new: Hypotheses, symmetry: ObjectSymmetry
 ) -> tuple[float, float]:
-    """From the recorded best pose to the new one, metres and radians; NaN without a pose.
+    """Return metres and radians from the recorded best pose to the new one; NaN without one.
 
     symmetry: of the object, modulo which it is, at its centre.
     """

@@ -70,7 +70,7 @@ class StepRecorder(Recorder):
 
 @contextmanager
 def recording_in(path: Path | None) -> Iterator[StepRecorder]:
-    """A recorder of a session that ends with the context, into a file that is whole, or none."""
+    """Open the recorder of a session, into a file that is whole at the end, or does not exist."""
     if path is None:
         yield StepRecorder(None)
         return
@@ -87,7 +87,7 @@ def recording_in(path: Path | None) -> Iterator[StepRecorder]:
 
 
 def probe_config(plan: Plan, trial: Trial, policy: Contender | None = None) -> ProbeConfig:
-    """What `runners.probe` would be asked for, with the first method, to probe as in a trial."""
+    """Return the configuration of `runners.probe` for the probes of a trial."""
     first = next(iter(plan.contenders.values()), None)
     return ProbeConfig(
         object=plan.object_config(trial.configuration),
@@ -106,7 +106,7 @@ def probe_config(plan: Plan, trial: Trial, policy: Contender | None = None) -> P
 
 
 def config_values(config: ProbeConfig) -> dict[str, Any]:
-    """The same as `session_started` takes it."""
+    """Return the configuration as `session_started` takes it."""
     return {name: vars(v) if is_dataclass(v) else v for name, v in vars(config).items()}
 
 
@@ -162,19 +162,19 @@ def make_session(plan: Plan, trial: Trial) -> None:
 
 
 def read_told(folder: Path) -> dict[str, Any]:
-    """What `make_session` wrote down: steps with a registration, and why some have no set."""
+    """Return what `make_session` wrote: steps with a registration, and why some have no set."""
     return dict(json.loads((folder / "session.json").read_text()))
 
 
 def open_recorded(plan: Plan, trial: Trial) -> RecordedSession:
-    """The session of a trial, from its recording."""
+    """Return the session of a trial, from its recording."""
     path, settings = trial.folder(plan) / "session.mcap", plan.session_settings(trial)
     start = settings.start_contacts, settings.start_probe
     return RecordedSession(RecordedSettings(str(path), *start))
 
 
 def plausible_settings_of(plan: Plan, session: RecordedSession) -> PlausibleSettings:
-    """The definition of the plausible sets of a session."""
+    """Return the definition of the plausible sets of a session."""
     config = session.recorded.config["object"]
     return plan.plausible_settings(float(config["epsilon"]))
 
@@ -182,7 +182,7 @@ def plausible_settings_of(plan: Plan, session: RecordedSession) -> PlausibleSett
 def problems(
     plan: Plan, trial: Trial, session: RecordedSession, settings: OnlineSettings = _ONE
 ) -> Iterator[RegistrationProblem]:
-    """What is known at every step with a registration, of which none follows from a result."""
+    """Yield the problem of every step with a registration; none follows from a result."""
     online = session.online(settings, trial.seed, only=plan.steps_of(trial.configuration))
     steps = online.steps(session.perceived())
     return (step.problem for step in steps if step.problem is not None)
@@ -194,7 +194,7 @@ def made_set(
     truth: FloatArray,
     settings: PlausibleSettings,
 ) -> tuple[PlausibleSet, bool]:
-    """The set of a step, and whether it was there."""
+    """Return the set of a step, and whether it was there."""
     found = sets.load_plausible(folder, problem, settings, world_from_object=truth)
     if found is not None:
         return found, True
