@@ -1,4 +1,4 @@
-"""What commands print: a name is shown as it is, never read as markup or sent as a control."""
+"""Output of commands: a name is shown as it is, never read as markup or sent as a control."""
 
 from __future__ import annotations
 

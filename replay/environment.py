@@ -1,4 +1,4 @@
-"""What a result could depend on besides its inputs: versions, platform, checkout."""
+"""The environment of a result besides its inputs: versions, platform, checkout."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def open_recorder(mcap: Path | None, rerun: Path | None = None, *, live: bool = 
         from replay.rerun.rerun_recorder import RerunRecorder
 
         pictures = RerunRecorder(rerun, live=live)
-    optional = "" if mcap is None else "`replay view` makes it anew"
+    optional = "" if mcap is None else "`replay view` makes it"
     return Recorders(files, pictures, live=live, optional=optional)
 
 

@@ -60,7 +60,7 @@ class PublishedConfig:
 
     @property
     def folder(self) -> Path:
-        """Of the sets."""
+        """Folder of the sets."""
         evaluation = Path(self.dir or "").expanduser()
         return Path(self.out).expanduser() if self.out else evaluation / "package"
 
@@ -124,21 +124,18 @@ def found_trials(config: PublishedConfig) -> list[tuple[Trial, Path]]:
 
 @dataclass(frozen=True)
 class PackageSession:
-    """One draw of a trial: what registers it, and the files of what is found, in a folder of sets.
-
-    session: the trial's recording. steps: those to register.
-    """
+    """One draw of a trial, registered by the package, and the files of its results."""
 
     package: PublishedPackage
-    folder: Path
+    folder: Path  # of all sets
     trial: Trial
     draw: int
-    session: Path
-    steps: tuple[int, ...]
+    session: Path  # the trial's recording
+    steps: tuple[int, ...]  # those to register
 
     @property
     def unit(self) -> Task:
-        """As progress names it."""
+        """The task, as progress names it."""
         return Task(self.trial, repeat_label("package", self.draw))
 
     @property
@@ -149,7 +146,7 @@ class PackageSession:
 
     @property
     def about(self) -> Path:
-        """How the sets came about, and why steps have none; written last."""
+        """File of how the sets came about, and why steps have none; written last."""
         return self.sets.with_suffix(".about.json")
 
     def failures(self) -> Mapping[str, str] | None:

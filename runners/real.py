@@ -44,7 +44,7 @@ from runners.sensors.depth_frame import SUFFIXES as FRAMES
 from runners.sessions.problem_source import open_source
 
 MADE = "made.json"
-"""What made results.csv, beside it."""
+"""Name of the file beside results.csv that says how that was made."""
 _RIGHT = (0.005, pi / 36.0)  # m and radians (5 degrees): errors of a hypothesis that is right
 _EPSILON = 0.001  # m, of plausible sets, which are not made here
 _SPLIT = 1  # the random stream, of a seed, that halves the touches

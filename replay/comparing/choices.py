@@ -25,7 +25,7 @@ Made = TypeVar("Made")
 
 
 class Choosable(NamedTuple, Generic[Made]):
-    """What can be chosen by name and settings."""
+    """A kind of thing that is chosen by name and settings: methods, or policies."""
 
     name: str  # also of its group in a session's configuration
     names: tuple[str, ...]
@@ -50,7 +50,7 @@ class Choice(Generic[Made]):
 
     @property
     def config(self) -> dict[str, Any]:
-        """As the configuration of a recording has it."""
+        """Name and settings in the form of a recording's configuration."""
         return {"name": self.name, **settings_mapping(self.settings)}
 
     def build(self) -> Made:

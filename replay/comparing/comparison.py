@@ -68,12 +68,12 @@ COLUMNS: Mapping[str, Column] = {
     "diversity": Column("diversity_mm2", "plausible diversity, mm²", "PD\nmm²"),
     "seconds": Column("seconds_s", "time, ms", "ms", 1e3),
 }
-"""All numbers by the names that `Outcome.numbers` has, in the order in which they are shown."""
+"""Columns by the names of `Outcome.numbers`, in the order in which they are shown."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What one method, or the recording, has for one step."""
+    """The result of one method, or of the recording, at one step."""
 
     step: int
     label: str
@@ -87,10 +87,10 @@ class Outcome:
 
 @dataclass(frozen=True)
 class CommonCost:
-    """The one cost that the hypotheses of all methods are judged by; name: for people."""
+    """The one cost by which the hypotheses of all methods are judged."""
 
     settings: CostSettings
-    name: str
+    name: str  # for people
 
 
 def common_cost(recording: Recording) -> CommonCost:

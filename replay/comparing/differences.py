@@ -1,4 +1,4 @@
-"""How values and events differ to the bit, in words and in units in the last place."""
+"""Differences of values and events to the bit, in words and in units in the last place."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from chsel.events import (
 ABSENT = object()
 """Stands for a value that one side does not have."""
 RELATIVE, ABSOLUTE = 1e-9, 1e-12
-"""How far a measured number may be from the recorded one: libraries may round otherwise."""
+"""Tolerance of a measured number beside the recorded one: libraries may round otherwise."""
 
 ERRORS = 1e-4
 """m or rad: how far errors to the true pose may be, as symmetries depend on LAPACK and libigl."""
@@ -146,7 +146,7 @@ def _shown(value: Any) -> str:
 
 @dataclass
 class ResultDifferences:
-    """What differs between a recorded registration or decision and another one, stage by stage."""
+    """The differences of a registration or decision from the recorded one, stage by stage."""
 
     stage: str = ""  # the first that differs; empty if none does
     before: int = 0  # how many stages before it are equal
@@ -191,8 +191,8 @@ def event_name(event: Event) -> tuple[str, int, str]:
         case Traced():
             about = f"{event.stage} iteration {event.iteration}"
         case SnapshotTaken():
-            again = event.archive.refinement
-            about = f"iteration {event.archive.iteration}" + f" (pass {again + 1})" * (again > 0)
+            passes = event.archive.refinement
+            about = f"iteration {event.archive.iteration}" + f" (pass {passes + 1})" * (passes > 0)
         case SensorImage():
             about = event.sensor
     return event.topic, event.step, about

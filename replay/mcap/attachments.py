@@ -1,4 +1,4 @@
-"""What stands once in a recording, beside its messages: the object's mesh and its SDF grid."""
+"""The attachments of a recording: the object's mesh and its SDF grid."""
 
 from __future__ import annotations
 

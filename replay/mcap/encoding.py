@@ -33,7 +33,7 @@ class Kind:
     optional: bool
     checks: tuple[Check, ...]
     dtype: np.dtype[Any] | None
-    """Of an array; None for all else."""
+    """Type of the entries of an array; None for all else."""
     shape: tuple[str, ...]
     """Lengths of an array: numbers, or letters."""
     narrow: bool

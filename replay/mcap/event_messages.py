@@ -154,12 +154,12 @@ class RecordedProblem:
 
     @property
     def step(self) -> int:
-        """Of the registration."""
+        """Step of the registration."""
         return int(self.values["step"])
 
     @property
     def seed(self) -> int:
-        """Of the random streams."""
+        """Seed of the random streams."""
         return int(self.values["key_seed"])
 
     def completed(self, sdf: SdfGrid, points: KnownPoints) -> RegistrationProblem:
@@ -212,7 +212,7 @@ def _rig_from(values: Mapping[str, Any]) -> RigDescribed:
 
 @dataclass(frozen=True)
 class ImagePlace:
-    """Where an image of a sensor stands among the events: its pixels are read when they matter."""
+    """The place of a sensor's image among the events; its pixels are read when they matter."""
 
     topic = SensorImage.topic
 
@@ -318,7 +318,7 @@ class RecordedDecision:
 
     @property
     def step(self) -> int:
-        """Which it follows."""
+        """Step of the registration that the decision follows."""
         return int(self.values["step"])
 
     def completed(

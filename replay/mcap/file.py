@@ -33,7 +33,7 @@ MALFORMED = (
     OverflowError,
     MemoryError,
 )
-"""What reading records may raise."""
+"""Errors of reading records."""
 
 COMPRESSIONS = ("", "zstd", "lz4")  # of chunks that are read
 ACCEPTED = "accepted: a recording.mcap that this project wrote"

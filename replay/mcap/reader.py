@@ -38,15 +38,7 @@ Placed = TypeVar("Placed", RecordedProblem, RecordedDecision)
 
 
 class Recording:
-    """What a session left behind.
-
-    path: of the file. damage: what cut reading short, None if the file is whole. start: how the
-    session began. ended: how it ended, None if it did not. probes: in their order. steps: those
-    with a registration problem. rig: of a recorded robot session, else None. image_steps: those
-    with images of sensors. offered: the first actions of a steered session, else None.
-    decision_steps: those that a decision follows, -1 for that before the first probe. attachments:
-    bytes of each, by name.
-    """
+    """A session, as its recording has it."""
 
     def __init__(
         self, path: Path, entries: list[Entry], damage: str | None, attachments: Mapping[str, int]
@@ -55,18 +47,22 @@ class Recording:
             why = "" if damage is None else f": it is {damage}"
             raise RecordingError(f"recording {path} has no session in it{why}")
         self.path = path
-        self.damage = damage
-        self.attachments = attachments
+        self.damage = damage  # what cut reading short, None if the file is whole
+        self.attachments = attachments  # bytes of each, by name
         self.start = entries[0]
+        # None if the session did not end.
         self.ended = next((entry for entry in entries if isinstance(entry, SessionEnded)), None)
-        self.probes = [entry for entry in entries if isinstance(entry, Probe)]
+        self.probes = [entry for entry in entries if isinstance(entry, Probe)]  # in their order
+        # Those with a registration problem.
         self.steps = tuple(entry.step for entry in entries if isinstance(entry, RecordedProblem))
+        # None unless a robot's log was read.
         self.rig = next((entry for entry in entries if isinstance(entry, RigDescribed)), None)
         seen = (entry.step for entry in entries if isinstance(entry, ImagePlace))
-        self.image_steps = tuple(dict.fromkeys(seen))
+        self.image_steps = tuple(dict.fromkeys(seen))  # those with images of sensors
+        # The first actions of a steered session, else None.
         self.offered = next((entry for entry in entries if isinstance(entry, ActionsOffered)), None)
         decisions = (entry.step for entry in entries if isinstance(entry, RecordedDecision))
-        self.decision_steps = tuple(decisions)
+        self.decision_steps = tuple(decisions)  # those before a decision, -1 before the first probe
         self._entries = entries
 
     def events(self, *, images: bool = True) -> Iterator[Event]:
@@ -137,7 +133,7 @@ class Recording:
 
     @property
     def seed(self) -> int:
-        """Of the random streams of its registrations; without any that of the session."""
+        """Seed of the random streams of registrations; without any that of the session."""
         seeds = (entry.seed for entry in self._entries if isinstance(entry, RecordedProblem))
         return next(seeds, self.start.seed)
 

@@ -1,4 +1,4 @@
-"""What is whole in a damaged or unfinished recording, as a finished one."""
+"""The whole parts of a damaged or unfinished recording, as a finished one."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ _WRONG = (ChselError, ValueError, RecursionError)  # what reading a message may 
 
 @dataclass
 class Recovered:
-    """What a recovery kept and what is lost."""
+    """The parts of a recording that a recovery kept, and those that are lost."""
 
     damage: str | None = None  # why the file cannot be read as it is; None if it can
     probes: list[int] = field(default_factory=list)  # steps of those kept

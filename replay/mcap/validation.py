@@ -1,4 +1,4 @@
-"""What the table of messages accepts, and in which order the events of a session can come.
+"""Checks of the values of messages, and of the order of the events of a session.
 
 The writer lets nothing else into a recording, and the reader nothing else out: a file of another
 program, or a damaged one, is an error and not a wrong result. Files made to exhaust time or memory
@@ -253,16 +253,12 @@ def check_digest(what: str, digest: str, recorded: str) -> None:
 
 
 class EventOrder:
-    """Follows the events of one session: steps ascend, and a step has one problem, one result.
-
-    step: of the last event, -1 before all steps. has_rig: whether a rig was described.
-    has_actions: whether actions were offered.
-    """
+    """The order of the events of one session: steps ascend, with one problem and result each."""
 
     def __init__(self) -> None:
-        self.step = _BEFORE_ALL_STEPS
-        self.has_rig = False
-        self.has_actions = False
+        self.step = _BEFORE_ALL_STEPS  # of the last event
+        self.has_rig = False  # a rig was described
+        self.has_actions = False  # actions were offered
         self._probe = _BEFORE_ALL_STEPS  # the step of the last probe
         self._posed = _BEFORE_ALL_STEPS  # the step of the last problem
         self._registering = False  # a problem is posed and has no result yet

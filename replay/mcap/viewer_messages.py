@@ -1,4 +1,4 @@
-"""What a viewer draws of a session without our help: the object, the hypotheses, all points.
+"""Messages that other viewers draw: the object, the hypotheses, all points.
 
 Foxglove draws the meshes. Rerun passes them by and draws the clouds. All of it repeats what other
 messages say, rounded.
@@ -169,9 +169,9 @@ class SceneMessages:
 class CumulativePoints:
     """Spreads points over levels: the newest at level 0, each further level 8 times as large.
 
-    The levels together hold all points. A level is written anew when it changes, so that a point
+    The levels together hold all points. A level is written when it changes, so that a point
     is written about 4 times at each level it passes, however long the session. Writing all points
-    anew at every step would take quadratic space.
+    at every step would take quadratic space.
     """
 
     def __init__(self) -> None:

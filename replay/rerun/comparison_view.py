@@ -37,7 +37,7 @@ CURVES: Mapping[str, tuple[str, float]] = {
     "closest_rotation_error": ("Rotation error of the closest [°]", DEGREES),
     "spread": ("Spread [mm]", MILLIMETRES),
 }
-"""What is drawn over probes, a curve for each method: title of the view, and its unit."""
+"""Numbers drawn over probes, a curve for each method: title of the view, and its unit."""
 _COLUMNS = (  # of the views of curves
     ("log10_best_cost", "log10_median_cost"),
     ("best_position_error", "best_rotation_error"),

@@ -21,7 +21,7 @@ _WIDTHS = (0.75, 0.35)  # radii of the arrows of actions that can be taken and t
 
 
 class Decisions:
-    """All that is drawn of decisions, in the scene, as curves and in the log.
+    """Drawings of decisions, in the scene, as curves and in the log.
 
     A forecast stands at the probe that it is of.
     """

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 NORMAL_LENGTH = 0.035  # in diagonals of the workspace
 CUMULATIVE = ("free", "occupied", "contacts", "contacts/normals", "known", "gripper/past")
-"""What each probe adds to: a view shows these over all probes up to the moment."""
+"""Entities to which each probe adds: a view shows these over all probes so far."""
 HIDDEN = np.zeros((1, 4, 4))
 """A pose that shows nothing: without any, the viewer draws the mesh once, at the origin."""
 LEVELS = 8

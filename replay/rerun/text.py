@@ -1,4 +1,4 @@
-"""What a session and its results are, as text for people."""
+"""Texts for people about a session and its results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can be done with a recording: a module a verb, each with add_arguments and run."""
+"""The verbs of `python -m replay`: a module each, with add_arguments and run."""
 
 from __future__ import annotations
 
@@ -16,4 +16,4 @@ VERBS = {
     for module in sorted(Path(__file__).parent.glob("*.py"))
     if module.stem != "__init__"
 }
-"""All verbs, with what each does."""
+"""Verbs, with what each does."""

@@ -1,4 +1,4 @@
-"""Record today's results as the expected ones, after showing what changes and asking."""
+"""Record new results as the expected ones, after showing what changes and asking."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ _NUMBERS = {
 
 @dataclass(frozen=True)
 class ResultChange:
-    """How a result differs from the recorded one.
+    """The change of a result from the recorded one.
 
     Numbers are those measured, best_cost, and where the plausible set of the step lies beside the
     recording coverage, plausibility and diversity in mm^2.
@@ -120,11 +120,11 @@ class ResultChange:
 
 
 def write_accepted(recording: Recording, path: Path) -> list[ResultChange]:
-    """Write the recording with today's results to a new file; how each result differs.
+    """Write the recording with new results to a file, and return how each result differs.
 
-    Registrations follow from today's results; decisions are of the recorded probes, whatever they
+    Registrations follow from new results; decisions are of the recorded probes, whatever they
     choose. Raise RecordingError if the recording was recovered with losses, behind which E_0 and
-    E_l do not follow from what is left. A recorded belief is that of today's result, too.
+    E_l do not follow from what is left. A recorded belief is that of the new result, too.
     """
     changes: list[ResultChange] = []
     seconds: dict[int, Timed] = {}

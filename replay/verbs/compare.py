@@ -268,9 +268,9 @@ def _results(recording: Recording, outcomes: Sequence[Outcome]) -> dict[str, dic
     for outcome in outcomes:
         if outcome.hypotheses is not None:
             results.setdefault(outcome.label, {})[outcome.step] = outcome.hypotheses
-    again = {outcome.label for outcome in outcomes if outcome.as_recorded}
-    again -= {outcome.label for outcome in outcomes if not outcome.as_recorded}
-    if again:
+    repeated = {outcome.label for outcome in outcomes if outcome.as_recorded}
+    repeated -= {outcome.label for outcome in outcomes if not outcome.as_recorded}
+    if repeated:
         results.pop(recorded_label(recording), None)
     return results
 

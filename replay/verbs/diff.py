@@ -83,7 +83,7 @@ def _table(found: RecordingDiff) -> Table:
 
 
 class Place(NamedTuple):
-    """What two events have in common to be compared."""
+    """The place of an event, which is that of the event that it is compared with."""
 
     topic: str
     step: int
@@ -109,7 +109,7 @@ class EventDifference(Difference):
 
 @dataclass
 class RecordingDiff:
-    """All that differs between two recordings."""
+    """The differences between two recordings."""
 
     same_bytes: bool  # whether the files are equal
     counts: Counter[str] = field(default_factory=Counter)  # events on each topic in either

@@ -295,7 +295,7 @@ EXPORTS = {
     "images": exported_images,
     "decisions": exported_decisions,
 }
-"""By the name that `--what` takes."""
+"""Exports by the name that `--what` takes."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""Make the Rerun recording anew from the MCAP file alone, and open it or save it."""
+"""Make the Rerun recording from the MCAP file alone, and open it or save it."""
 
 from __future__ import annotations
 

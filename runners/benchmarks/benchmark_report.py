@@ -1,4 +1,4 @@
-"""What a benchmark found: as JSON, and as a page of tables; docs/speed.md is one."""
+"""The results of a benchmark as JSON, and as a page of tables; docs/speed.md is one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is timed: registrations by this library and by the published package, and other calls."""
+"""Timed calls: registrations by this library and by the published package, and others."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _THREADS = (1, 2)
 
 @dataclass(frozen=True)
 class Steps(CheckedSettings):
-    """How much registrations do that are compared with the package, none of which stops early."""
+    """The amount of work of registrations beside the package, none of which stops early."""
 
     restarts: Annotated[int, positive] = 10  # of descent
     adam: Annotated[int, positive] = 50  # Adam steps of a restart
@@ -58,7 +58,7 @@ store("effort", "default", settings_mapping(Steps()))
 
 @dataclass(frozen=True)
 class Scope:
-    """How much is measured."""
+    """The amount of what is measured."""
 
     steps: Steps
     repeats: int
@@ -345,4 +345,4 @@ MEASURES: dict[str, Callable[[Scope], Iterator[Row]]] = {
     "methods": methods,
     "plausible_sets": plausible_sets,
 }
-"""What is measured of this library alone."""
+"""Measurements of this library alone."""

@@ -18,9 +18,9 @@ _FILES = {
     "rank": ("dir",),
     "report": ("dir",),
 }
-"""Of a command: the settings that words without a key are; the last takes all that are left."""
+"""Settings that words without a key are, by command; the last takes all that are left."""
 _OPEN_GROUPS = {"evaluate": ("settings", "outside", "policy"), "real": ("settings",)}
-"""Of a command: groups that may have any key, which Hydra wants to have ++ before it."""
+"""Groups that may have any key, by command; Hydra wants ++ before such a key."""
 _TAKES_VALUE = ("-c", "--cfg", "-p", "--package", "-cp", "-cn", "-cd", "-i", "--info")
 
 

@@ -1,4 +1,4 @@
-"""How hypotheses are measured: the definition of the plausible set, and the metrics beside it."""
+"""Metrics of hypotheses: by the plausible set and its definition, and those beside it."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def definition_text(definition: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class MetricsConfig(DistanceSettings):
-    """How distances are measured, and for which hypotheses."""
+    """Settings of the metrics: how distances are measured, and for which hypotheses."""
 
     quantile: float = 1.0  # of the hypotheses by their cost, the cheapest
 

@@ -1,4 +1,4 @@
-"""What an evaluation computes, as every worker knows it, and where its files are."""
+"""The plan of an evaluation, as every worker knows it, and the places of its files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ OBJECTS = {"models": "", "scans": "ycb/"}  # before the names of objects, by wha
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """All that determines the results, and where they go."""
+    """The settings of an evaluation that determine the results, and the folder of these."""
 
     folder: Path
     preset: str
@@ -69,17 +69,17 @@ class Plan:
 
     @property
     def kind(self) -> str:
-        """Of the sessions."""
+        """Kind of the sessions."""
         return str(self.session.get("kind"))
 
     @cached_property
     def configurations(self) -> dict[str, TrialConfiguration]:
-        """All that there are, by name."""
+        """Configurations of this kind by name, also those not chosen."""
         return configurations_of(self.kind, self.logs)
 
     @property
     def labels(self) -> list[str]:
-        """What a trial has a part of the table of: policies, or methods and external results."""
+        """Labels of the parts of a trial's table: policies, or methods and external results."""
         return [*self.policies] or [*self.contenders, *self.outside]
 
     def about(self, trial: Trial, label: str) -> dict[str, Any]:
@@ -173,7 +173,7 @@ class Trial:
 
 @dataclass(frozen=True, order=True)
 class Task:
-    """What one worker does at a time: the session of a trial, or a label's rows about it."""
+    """The work of one worker at a time: the session of a trial, or a label's rows about it."""
 
     trial: Trial
     label: str = ""  # of a contender or external results; "" for session and plausible sets

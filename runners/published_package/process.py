@@ -31,7 +31,7 @@ class PackageError(ChselError):
 
 @dataclass(frozen=True)
 class PackageConfig:
-    """Where the published package is."""
+    """The place of the published package."""
 
     python: str | None = None  # an interpreter that has the package
     directory: str = "~/.cache/chsel/published"  # else, where its environment is, or is made

@@ -47,16 +47,16 @@ _RC: Any = {
 
 @dataclass(frozen=True)
 class Style:
-    """How a method or policy looks. color: "#rrggbb". marker, line: as matplotlib calls them."""
+    """The looks of a method or policy."""
 
     title: str
-    color: str
-    marker: str
-    line: str
+    color: str  # "#rrggbb"
+    marker: str  # as matplotlib names it
+    line: str  # likewise
 
     @property
     def looks(self) -> dict[str, Any]:
-        """Of a line, as matplotlib takes them."""
+        """Arguments of matplotlib for a line."""
         return {"color": self.color, "marker": self.marker, "linestyle": self.line}
 
 

@@ -133,7 +133,7 @@ REQUESTS: dict[str, tuple[Callable[[Session, Json], Json], tuple[str, ...]]] = {
     "next_probe": (next_probe, tuple(Actions.__dataclass_fields__)),
     "close": (close, ()),
 }
-"""What answers a request to a session, and the names that the request may have."""
+"""The function that answers a request to a session, and the names that the request may have."""
 
 
 def answered(request: str, session: Session, body: bytes) -> Json:

@@ -1,3 +1,5 @@
+"""`chsel.register` and the public names: what they accept, warn of and refuse."""
+
 import dataclasses
 import re
 import warnings

@@ -1,3 +1,5 @@
+"""The loop of registrations: which problems follow from points and results."""
+
 from dataclasses import replace
 
 import numpy as np
