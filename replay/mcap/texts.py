@@ -1,4 +1,4 @@
-"""Texts of a recording: what a terminal or a viewer can show without being told what to do."""
+"""Texts of a recording: what a terminal or a viewer shows as it is, without control characters."""
 
 from __future__ import annotations
 

@@ -254,13 +254,13 @@ def exported_modes(recording: Recording, steps: str | None) -> Exported:
     position_deviation (metres) and rotation_deviation (radians) roots of the covariance's traces,
     m00 to m33 object_from_world.
     """
-    told = {e.step: e for e in recording.events(images=False) if isinstance(e, Believed)}
-    told = told or {e.step: e for e in _beliefs(recording)}
-    chosen = _chosen(recording, steps, [*told], "belief")
+    believed = {e.step: e for e in recording.events(images=False) if isinstance(e, Believed)}
+    believed = believed or {e.step: e for e in _beliefs(recording)}
+    chosen = _chosen(recording, steps, [*believed], "belief")
     arrays: dict[str, Any] = {"steps": np.array(chosen, dtype=np.int64)}
     tables = []
     for step in chosen:
-        parts = {name: part for name, part in vars(told[step]).items() if name != "step"}
+        parts = {name: part for name, part in vars(believed[step]).items() if name != "step"}
         arrays |= {f"step_{step}/{name}": part for name, part in parts.items()}
         squares = np.diagonal(parts["covariances"], axis1=1, axis2=2)
         columns = {

@@ -184,8 +184,8 @@ def _note(plan: Plan, task: Task, failure: str) -> str:
     """Make a failure a part of the table: a row a step, or one if there is no session's steps."""
     if failure and task.label:
         row = {**plan.about(task.trial, task.label), "status": f"failed: {failure}"}
-        told = task.trial.folder(plan) / "session.json"
-        steps = read_told(told.parent)["steps"] if told.exists() and not plan.policies else [None]
+        notes = task.trial.folder(plan) / "session.json"
+        steps = read_told(notes.parent)["steps"] if notes.exists() and not plan.policies else [None]
         rows = [{**row, "step": step} for step in steps]
         write_part(task.failed(plan), rows, PROBES if plan.policies else RESULTS)
     return failure

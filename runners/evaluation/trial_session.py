@@ -154,11 +154,11 @@ def make_session(plan: Plan, trial: Trial) -> None:
                 made_set(folder / "plausible", problem, truth, settings)
             except EvaluationError as error:
                 failures[str(problem.key.step)] = " ".join(str(error).split())
-    told: dict[str, Any] = {"steps": steps, "no_plausible_set": failures}
+    notes: dict[str, Any] = {"steps": steps, "no_plausible_set": failures}
     if TRUTH in session.recorded.config:
-        told[TRUTH] = session.recorded.config[TRUTH]
+        notes[TRUTH] = session.recorded.config[TRUTH]
     with whole_file(folder / "session.json") as beside:
-        beside.write_text(json.dumps(told, indent=2) + "\n")
+        beside.write_text(json.dumps(notes, indent=2) + "\n")
 
 
 def read_told(folder: Path) -> dict[str, Any]:

@@ -217,13 +217,13 @@ def _what_was_run(
 
 def true_pose_table(evaluation: Evaluation) -> Table:
     """Return how well true poses of sensors' logs fit, and their distance to guess and truth."""
-    told, lines = [], []
+    truths, lines = [], []
     for configuration, seed in evaluation.planned_trials:
         path = evaluation.folder / "trials" / configuration / f"seed_{seed}" / "session.json"
         if path.exists() and (truth := json.loads(path.read_text()).get("truth")):
-            told.append({**truth, "configuration": configuration})
-    found = pd.json_normalize(told)
-    groups = list(found.groupby("configuration", sort=False)) if told else []
+            truths.append({**truth, "configuration": configuration})
+    found = pd.json_normalize(truths)
+    groups = list(found.groupby("configuration", sort=False)) if truths else []
     for name, some in [*groups, (_ALL, found)] if len(groups) > 1 else groups:
         line = {"configuration": str(name), "trials": len(some)}
         for heading, (column, factor) in _TRUE_POSES.items():

@@ -6,6 +6,7 @@ first; a page or a program in `examples/` is tested by `tests/docs/`. Tests that
 after 12 seconds are skipped, which the last line counts: `make test` runs them.
 """
 
+import argparse
 import subprocess
 import sys
 import time
@@ -69,6 +70,7 @@ class Ordered:
 
 def main():
     """Run the tests of all changed files."""
+    argparse.ArgumentParser(prog="python -m tests.tools.changed", description=__doc__).parse_args()
     rooms = [tests_of(file) for file in changed_files()]
     named, others = ([test for room in rooms for test in room[n]] for n in (0, 1))
     files = list(dict.fromkeys([*named, *others]))
