@@ -38,7 +38,7 @@ def open_recorder(mcap: Path | None, rerun: Path | None = None, *, live: bool = 
 
 
 class Recorders(Recorder):
-    """Hands every event to the recorder of each file, at `flush` or when many wait.
+    """Recorders of files that get every event, at `flush` or when many wait.
 
     So a registration has the processor for itself. The caller waits for files to be written, but
     not for pictures, which a thread draws while the session goes on: an error of theirs is raised

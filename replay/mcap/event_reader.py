@@ -33,11 +33,11 @@ Entry = Event | RecordedProblem | RecordedDecision | ImagePlace
 
 
 class EventReader:
-    """Joins messages to events. `within` is the topic of an event whose points are yet to come."""
+    """A reader that joins messages to events."""
 
     def __init__(self, attachments: Mapping[str, bytes]) -> None:
         """Start before any event. attachments: those of the file by name, there at its first."""
-        self.within: str | None = None
+        self.within: str | None = None  # topic of an event whose points are yet to come
         self._attachments = attachments
         self._order = EventOrder()
         self._started = False

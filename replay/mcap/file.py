@@ -121,7 +121,7 @@ class StoredMessage:
 
 
 class McapFile:
-    """Reads one recording from start to end.
+    """A recording that is read from start to end.
 
     attachments: by name, those met so far. damage: what ended a partial reading. place: bytes that
     were whole by then. count: messages so far.

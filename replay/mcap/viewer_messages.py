@@ -72,7 +72,7 @@ View = tuple[str, Callable[[int], bytes]]
 
 
 class Views:
-    """Makes the messages for viewers that follow those of an event."""
+    """The messages for viewers that follow those of an event."""
 
     def __init__(self) -> None:
         self._points = {name: CumulativePoints() for name in POINT_CLASSES}
@@ -116,7 +116,7 @@ class Views:
 
 
 class SceneMessages:
-    """Makes the messages of one object."""
+    """The messages of one object."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self._vertices, faces = simple_mesh(mesh)
@@ -167,7 +167,7 @@ class SceneMessages:
 
 
 class CumulativePoints:
-    """Spreads points over levels: the newest at level 0, each further level 8 times as large.
+    """Points spread over levels: the newest at level 0, each further level 8 times as large.
 
     The levels together hold all points. A level is written when it changes, so that a point
     is written about 4 times at each level it passes, however long the session. Writing all points

@@ -50,7 +50,7 @@ _LIBRARY = "chsel-replay"  # without versions of packages, which stand in the se
 
 
 class McapRecorder(Recorder):
-    """Writes one recording to a new file.
+    """A recorder of one session to a new MCAP file.
 
     Log time counts messages, in nanoseconds, from one second per step: step k lies between k + 1 s
     and k + 2 s. No wall-clock time enters the file, but for `Timed` events if there are any.

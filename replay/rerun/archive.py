@@ -15,7 +15,7 @@ _MARK = (255, 255, 255)
 
 
 class ArchiveMap:
-    """Draws snapshots of archives under the entity `archive`; a unit of the view is one cell."""
+    """The map of an archive under the entity `archive`; a unit of the view is one cell."""
 
     def __init__(self, stream: rr.RecordingStream) -> None:
         self.size: tuple[int, int] | None = None  # width and height of the last map, in cells

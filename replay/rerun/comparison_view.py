@@ -79,7 +79,7 @@ def save_comparison(
 
 
 class _Comparison:
-    """Draws one scene for all, and the results of each method at entities of its number."""
+    """One scene for all methods, and the results of each at entities of its number."""
 
     def __init__(
         self, stream: rr.RecordingStream, recording: Recording, labels: Sequence[str]

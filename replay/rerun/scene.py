@@ -51,7 +51,7 @@ _HAND_ALPHA = 80
 
 
 class Scene:
-    """Draws everything but hypotheses and actions under the entity `scene`."""
+    """The entity `scene`: everything but hypotheses and actions."""
 
     def __init__(self, stream: rr.RecordingStream) -> None:
         self._stream = stream
@@ -188,7 +188,7 @@ def deepest(gripper_path: FloatArray) -> int:
 
 
 class HypothesisMeshes:
-    """Draws sets of hypotheses under the entity `root`: one mesh a step of the scale, and poses."""
+    """Sets of hypotheses under the entity `root`: one mesh a step of the scale, and poses."""
 
     def __init__(self, stream: rr.RecordingStream, root: str = "scene/hypotheses") -> None:
         self._stream = stream

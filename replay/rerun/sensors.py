@@ -32,7 +32,7 @@ _CLASSES = {
 
 
 class SensorImages:
-    """Draws images under `sensors`, and depth cameras in the scene.
+    """Images under `sensors`, and depth cameras in the scene.
 
     At a probe, the picture of a camera is the last of that probe, and that of a pad the one with
     the largest contact; all others stand at moments of their own on the timeline of iterations.

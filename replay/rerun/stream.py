@@ -80,7 +80,7 @@ def flush(stream: rr.RecordingStream, path: Path | None, *, must: bool = True) -
 
 
 class Clock:
-    """Sets the times of what is logged.
+    """The times at which events are logged.
 
     On the timeline `probe` a moment is the step of a probe, and shows what was known and found by
     its end. On `iteration` it is a running count of the iterations of all stages of all

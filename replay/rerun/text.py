@@ -30,7 +30,7 @@ COLORS = """
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes a value out each time, also where one object stands in two places."""
+    """A dumper of YAML that writes an object out at each of its places."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True

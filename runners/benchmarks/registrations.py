@@ -190,7 +190,7 @@ OURS = (*PRESETS, *SIZES)
 
 
 class BenchmarkError(ChselError):
-    """Both sides would not do the same work."""
+    """The error that both sides would not do the same work."""
 
 
 def method(name: str, steps: Steps, search: int) -> Method:

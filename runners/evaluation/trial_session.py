@@ -44,7 +44,7 @@ _ONE = OnlineSettings(hypotheses=1)  # E_0 of one pose, which stands for any
 
 
 class StepRecorder(Recorder):
-    """Hands the events of a step to another recorder, if there is one, when the step ends."""
+    """A recorder that passes the events of a step on, if there is another, when the step ends."""
 
     def __init__(self, recorder: Recorder | None) -> None:
         self.step = 0  # of the last probe

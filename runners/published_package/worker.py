@@ -26,7 +26,7 @@ _COSTS = {"default": "VolumetricDirectSDFCost", "equation": "VolumetricDoubleDir
 
 
 class GridSdf:
-    """Stands where the package has the mesh: answers every query by the nearest node of our grid.
+    """A stand-in for the package's mesh, which answers queries by the nearest node of our grid.
 
     So both packages read the same signed distances, and the query of the whole mesh that the
     package's constructor makes costs it next to nothing.
