@@ -1,10 +1,6 @@
-# make probe: set up and run a session. make test: set up and run the checks of every commit.
-# make test-all: those that take long and rarely fail, too.
-# make docs: the documentation as a site with search, build/site/index.html.
-# make mutants ROOM=chsel/next_probe: how many single mistakes in a room its tests notice.
-# make PYTHON=python3.12 probe: with another Python, 3.11 or newer.
-# make PIP_ARGS="--extra-index-url URL" probe: with options for pip install.
-# make VENV_ARGS=--system-site-packages probe: with the packages that PYTHON has already.
+# Options: make PYTHON=python3.12 probe: with another Python, 3.11 or newer.
+#          make PIP_ARGS="--extra-index-url URL" probe: with options for pip install.
+#          make VENV_ARGS=--system-site-packages probe: with the packages that PYTHON has already.
 
 PYTHON ?= python3
 PIP_ARGS ?=
@@ -13,31 +9,40 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL = $(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint $(VENV)/constraints.txt
 
-.PHONY: probe test test-all docs mutants clean
+.PHONY: help probe check lint test test-all docs mutants clean
 
-probe: $(VENV)/.installed
+help: ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' Makefile | expand -t 10
+	@sed -n '/^# Options/,/^$$/s/^# //p' Makefile
+
+probe: $(VENV)/.installed ## set up and run a session
 	@if $(BIN)/python -c "import pybullet" 2>/dev/null; then session=simulated; else \
 		session=kinematic; \
 		echo "PyBullet has no wheel for this Python (it has for 3.11): running session=kinematic"; \
 	fi; \
 	$(BIN)/python -m runners.probe object=drill method=chsel session=$$session
 
-test: $(VENV)/.installed-test
+check: lint ## linter, types, and tests of what differs from the last commit, in half a minute
+	$(BIN)/python -m tests.tools.changed
+
+lint: $(VENV)/.installed-test ## linter, format and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+test: lint ## the checks of every commit
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
-test-all: $(VENV)/.installed-test
+test-all: $(VENV)/.installed-test ## all tests, with those that take long and rarely fail
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "slow or not slow"
 
-docs: $(VENV)/constraints.txt
+docs: $(VENV)/constraints.txt ## the documentation as a site with search, build/site/index.html
 	$(INSTALL) --editable ".[docs]"
 	rm -rf build/pages && mkdir -p build/pages
 	cp -r --parents *.md CITATION.cff LICENSE docs examples replay/*.png replay/*.webp build/pages
 	$(BIN)/python -m zensical build --strict --clean
 
-mutants: $(VENV)/.installed-test
+mutants: $(VENV)/.installed-test ## how many single mistakes the tests of ROOM=chsel/next_probe notice
 	$(INSTALL) --editable ".[mutants]"
 	$(BIN)/python -m tests.tools.mutants $(ROOM)
 
@@ -60,5 +65,5 @@ $(VENV)/.installed-test: $(VENV)/.installed
 	$(INSTALL) --editable ".[test]"
 	@touch $@
 
-clean:
+clean: ## delete the environment and all that was built
 	rm -rf $(VENV) build dist *.egg-info

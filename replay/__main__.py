@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def program() -> NoReturn:
-    """The command `chsel-replay`."""
+    """Run the command `chsel-replay`."""
     if COMPLETES in os.environ:
         _complete(os.environ["COMP_LINE"].split())
     sys.exit(main())
@@ -69,7 +69,7 @@ def _complete(words: Sequence[str]) -> None:
 
 
 def _parser(verb: str) -> Parser:
-    """The parser of all verbs, with the arguments of one."""
+    """Return the parser of all verbs, with the arguments of one."""
     parser = Parser(prog="replay", description=__doc__)
     parser.add_argument(TRACEBACK, action="store_true", help="show where an error came from")
     version = f"chsel-replay {package_version()}"
@@ -89,7 +89,7 @@ def _module(verb: str) -> ModuleType:
 
 
 def _message(error: Exception) -> str:
-    """One line: what was wrong, and what is accepted."""
+    """Return one line: what was wrong, and what is accepted."""
     if isinstance(error, MemoryError):
         return f"there is not enough memory: {error or 'an array is too large'}"
     if isinstance(error, OSError):

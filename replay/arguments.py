@@ -16,14 +16,14 @@ _PART = re.compile(r"(-?\d{1,10})|(-?\d{1,10})?\.\.(-?\d{1,10})?")
 
 
 def path_argument(text: str) -> Path:
-    """The path, with ~ for the home folder, which no shell expands in --save=~/FILE."""
+    """Return the path, with ~ for the home folder, which no shell expands in --save=~/FILE."""
     return Path(os.path.expanduser(text))
 
 
 def chosen_steps(text: str | None, existing: Sequence[int]) -> tuple[int, ...]:
-    """Those of the existing steps that a text names, in their order; None: all of them.
+    """Return the existing steps that a text names, in their order; None names all of them.
 
-    A range may reach beyond the steps that exist, but must meet one. Raises SettingError for a
+    A range may reach beyond the steps that exist, but must meet one. Raise SettingError for a
     text of another form, a step that does not exist, and a range without any.
     """
     if text is None:
@@ -33,7 +33,7 @@ def chosen_steps(text: str | None, existing: Sequence[int]) -> tuple[int, ...]:
 
 
 def _steps_of(part: str, existing: Sequence[int]) -> list[int]:
-    """The existing steps within one part, at least one."""
+    """Return the existing steps within one part, at least one."""
     match = _PART.fullmatch(part)
     if match is None or not part:
         raise SettingError(f"{part!r} names no steps; accepted: {STEPS_HELP}")

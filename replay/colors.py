@@ -82,13 +82,13 @@ class CostScale:
 
     @classmethod
     def of(cls, cost: ArrayLike) -> CostScale:
-        """The scale of a set of costs; finite ones count, of none at all the scale is 0 to 0."""
+        """Return the scale of the finite ones of some costs, 0 to 0 if there are none."""
         values = np.asarray(cost, dtype=np.float64).ravel()
         values = values[np.isfinite(values)]
         return cls(float(values.min()), float(values.max())) if len(values) else cls(0.0, 0.0)
 
     def fraction(self, cost: ArrayLike) -> FloatArray:
-        """Place of each cost on the scale, in [0, 1]."""
+        """Return place of each cost on the scale, in [0, 1]."""
         values = np.asarray(cost, dtype=np.float64)
         start = max(self.low, self.high * _FLOOR)
         if not start < self.high:
@@ -98,24 +98,24 @@ class CostScale:
 
 
 def score_fractions(score: FloatArray) -> FloatArray:
-    """Place (A,) of each finite score, from the lowest (0) to the highest (1), or all 1."""
+    """Return place (A,) of each finite score, from the lowest (0) to the highest (1), or all 1."""
     low, high = float(score.min(initial=np.inf)), float(score.max(initial=-np.inf))
     return (score - low) / (high - low) if high > low else np.ones(len(score))
 
 
 def cost_colors(fraction: ArrayLike) -> ColorArray:
-    """Colours (..., 3) of places on a cost scale (...): bright where the cost is low."""
+    """Return colours (..., 3) of places (...) on a scale of costs, bright for low ones."""
     place = np.clip(np.asarray(fraction, dtype=np.float64), 0.0, 1.0)
     return _between(_VIRIDIS, 1.0 - np.rint(place * _LEVELS) / _LEVELS)
 
 
 def score_colors(fraction: ArrayLike) -> ColorArray:
-    """Colours (..., 3) of places on a scale of scores (...): bright where the score is high."""
+    """Return colours (..., 3) of places (...) on a scale of scores, bright for high ones."""
     return _between(_EMBERS, np.clip(np.asarray(fraction, dtype=np.float64), 0.0, 1.0))
 
 
 def _between(colors: FloatArray, fraction: FloatArray) -> ColorArray:
-    """Colours (..., 3) at places (...) in [0, 1] along a row of colours (N, 3)."""
+    """Return colours (..., 3) at places (...) in [0, 1] along a row of colours (N, 3)."""
     place = (len(colors) - 1) * fraction
     steps = np.arange(len(colors))
     channels = [np.interp(place, steps, colors[:, channel]) for channel in range(3)]
@@ -123,5 +123,5 @@ def _between(colors: FloatArray, fraction: FloatArray) -> ColorArray:
 
 
 def number(value: float) -> str:
-    """A number for a label: three digits that count, and no exponent where it would be longer."""
+    """Return the label of a number: three digits, and no exponent where it would be longer."""
     return f"{value:.0f}" if 1e3 <= abs(value) < 1e5 else f"{value:.3g}"

@@ -1,4 +1,4 @@
-"""What commands print: a name is shown as it is, never read as markup or sent as a control."""
+"""Output of commands: a name is shown as it is, never read as markup or sent as a control."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MOST_LABELS = 0.6  # of the width of a terminal: texts that stand beside each p
 
 
 def printable(text: str, *, keep: str = "") -> str:
-    """The text with every character that would steer a terminal escaped, such as \\x1b.
+    """Return the text with every character that would steer a terminal escaped, such as \\x1b.
 
     keep: characters that stay as they are.
     """
@@ -92,7 +92,7 @@ class Console(rich.console.Console):
         super().print(*shown, **options)
 
     def _blocks(self, table: Table) -> list[Table]:
-        """The table; if it is too wide, tables that fit and all begin with its columns of texts."""
+        """Return the table or, if it is too wide, parts that fit; each begins with its texts."""
         columns = range(len(table.columns))
         numbers = [n for n in columns if table.columns[n].overflow != "fold"]
         labels = range(max(1, numbers[0])) if numbers else columns
@@ -115,7 +115,7 @@ class Console(rich.console.Console):
         return Measurement.get(self, self.options.update(width=10_000), table).maximum
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Every text comes through here: what is printed, and each cell and title of a table."""
+        """Return printable text; each printed text, cell and title of a table passes here."""
         options |= {"markup": False, "emoji": False}
         return super().render_str(printable(text, keep="\n"), **options)
 
@@ -123,7 +123,7 @@ class Console(rich.console.Console):
 def plain_table(
     title: str = "", *, texts: Sequence[str] = (), numbers: Sequence[str] = ()
 ) -> Table:
-    """A table without lines between its columns, those of texts first."""
+    """Return a table without lines between its columns, those of texts first."""
     table = Table(
         title=title or None,
         title_justify="left",
@@ -141,7 +141,7 @@ def plain_table(
 
 
 def _part(table: Table, columns: Sequence[int]) -> Table:
-    """A table of some of the columns of another one."""
+    """Return a table of some of the columns of another one."""
     part = copy(table)
     part.columns = [replace(table.columns[n], _index=i) for i, n in enumerate(columns)]
     return part
@@ -152,7 +152,7 @@ class Progress(rich.progress.Progress):
 
     @classmethod
     def get_default_columns(cls) -> tuple[rich.progress.ProgressColumn, ...]:
-        """The description, the bar, and how much is done."""
+        """Return the description, the bar, and how much is done."""
         _, *columns = super().get_default_columns()
         return (TextColumn("{task.description}"), *columns)
 
@@ -164,5 +164,5 @@ class TextColumn(rich.progress.TextColumn):
         super().__init__(text_format, markup=False)
 
     def render(self, task: rich.progress.Task) -> Text:
-        """The text of a task."""
+        """Return the text of a task."""
         return Text(printable(self.text_format.format(task=task)))

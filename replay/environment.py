@@ -1,4 +1,4 @@
-"""What a result could depend on besides its inputs: versions, platform, checkout."""
+"""The environment of a result besides its inputs: versions, platform, checkout."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PACKAGES = (
 
 
 def environment() -> dict[str, str]:
-    """Names and values, equal for every run of one checkout on one machine."""
+    """Return names and values, equal for every run of one checkout on one machine."""
     values = {
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",
@@ -37,7 +37,7 @@ def environment() -> dict[str, str]:
 
 
 def environment_differences(start: SessionStarted) -> tuple[str, ...]:
-    """What of the recorded environment is otherwise here."""
+    """Return the lines of the recorded environment that differ here."""
     here = environment()
     return tuple(
         f"{name} {value} -> {here.get(name, 'unknown')}"
@@ -47,7 +47,7 @@ def environment_differences(start: SessionStarted) -> tuple[str, ...]:
 
 
 def _processor() -> str:
-    """Model name of the processor."""
+    """Return the model name of the processor."""
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -58,7 +58,7 @@ def _processor() -> str:
 
 
 def _checkout() -> str:
-    """Commit of the checkout that runs, and whether files differ from it; "none" if installed."""
+    """Return the commit that runs, and whether files differ from it; "none" if installed."""
     folder = Path(__file__).resolve().parent
     try:
         described = subprocess.run(

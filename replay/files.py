@@ -15,7 +15,7 @@ _DIGEST_SIZE = 16  # bytes
 
 
 def sync_file(path: Path) -> None:
-    """Wait until the content of a file is on the disk. Raises OSError if it does not get there."""
+    """Wait until the content of a file is on the disk. Raise OSError if it does not get there."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
 
@@ -31,7 +31,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def disk_error(error: BaseException, path: Path) -> OSError | None:
-    """The failure to write `path` that is, or caused, an error; None if it is about other things.
+    """Return the failure to write `path` behind an error; None if it is about other things.
 
     A full disk is reported without the name of a file.
     """
@@ -47,9 +47,9 @@ class WritingError(ChselError):
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """A path beside `path` to write to; it becomes `path` if all went well, else it is removed.
+    """Open a path beside `path`; it becomes `path` if all went well, else it is removed.
 
-    It is on the disk then, for good. Raises RecordingError if there is such a file already, before
+    It is on the disk then, for good. Raise RecordingError if there is such a file already, before
     or after, and if it cannot be written.
     """
     require_new(path)
@@ -67,7 +67,7 @@ def new_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_file(path: Path, accepted: str = "an out=DIR that can be written") -> Iterator[Path]:
-    """A path beside `path` to write to, which replaces `path` once all is on the disk.
+    """Open a path beside `path` to write to; it replaces `path` once all is on the disk.
 
     accepted: what to do about it if either cannot be written: the end of the WritingError.
     """
@@ -126,7 +126,7 @@ def _rename(beside: Path, path: Path) -> None:
 
 
 def file_digest(path: Path) -> str:
-    """BLAKE2b (128 bit, hexadecimal) of a file's bytes, as `b2sum -l 128` prints it."""
+    """Return BLAKE2b (128 bit, hexadecimal) of a file's bytes, as `b2sum -l 128` prints it."""
     refuse_special_file(str(path), path, RecordingError)
     try:
         with path.open("rb") as file:

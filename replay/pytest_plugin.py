@@ -19,7 +19,7 @@ _SUFFIX = ".mcap"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """--replays DIR, and the setting `replays`."""
+    """Add --replays DIR, and the setting `replays`."""
     group = parser.getgroup("replays", "stored registrations, run again")
     group.addoption(
         "--replays",
@@ -41,7 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
-    """A recording that lies where recordings are tests."""
+    """Return the items of a recording that lies where recordings are tests."""
     if file_path.suffix != _SUFFIX:
         return None
     config = parent.config
@@ -58,7 +58,7 @@ class StoredReplay(pytest.File):
     _verdicts: Mapping[str, Verdict] = {}
 
     def collect(self) -> Iterable[pytest.Item]:
-        """An item for each registration that has a result, and for each decision.
+        """Return an item for each registration that has a result, and for each decision.
 
         A file that cannot be used has one that fails.
         """
@@ -90,7 +90,7 @@ class StoredReplay(pytest.File):
             yield ReplayedItem.from_parent(self, name=name, step=step)
 
     def verdict(self, name: str) -> Verdict:
-        """The verdict of an item; with the first come those of all selected steps."""
+        """Return the verdict of an item; with the first come those of all selected steps."""
         from replay.comparing.verification import verify
         from replay.mcap.reader import read_recording
 
@@ -124,5 +124,5 @@ class ReplayedItem(pytest.Item):
             pytest.fail(f"{printable(str(self.path))}: {verdict.report()}", pytrace=False)
 
     def reportinfo(self) -> tuple[Path, None, str]:
-        """Where it is."""
+        """Return the file of the item."""
         return self.path, None, f"{self.path.name}: {self.name}"

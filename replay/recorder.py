@@ -21,10 +21,10 @@ _LOG_FILTER = "error,re_log_encoding=off,re_sdk=off"
 
 
 def open_recorder(mcap: Path | None, rerun: Path | None = None, *, live: bool = False) -> Recorder:
-    """A recorder to an MCAP file, a Rerun recording, or both; live: to the Rerun viewer, too.
+    """Open a recorder to an MCAP file, a Rerun recording, or both. live: to the viewer, too.
 
     The session waits for the MCAP file, the full record, and not for the pictures; beside that
-    file, pictures that cannot be written are a warning. Raises RecordingError if a file exists.
+    file, pictures that cannot be written are a warning. Raise RecordingError if a file exists.
     """
     files = [] if mcap is None else [McapRecorder(mcap)]
     pictures: Recorder | None = None
@@ -33,12 +33,12 @@ def open_recorder(mcap: Path | None, rerun: Path | None = None, *, live: bool = 
         from replay.rerun.rerun_recorder import RerunRecorder
 
         pictures = RerunRecorder(rerun, live=live)
-    optional = "" if mcap is None else "`replay view` makes it anew"
+    optional = "" if mcap is None else "`replay view` makes it"
     return Recorders(files, pictures, live=live, optional=optional)
 
 
 class Recorders(Recorder):
-    """Hands every event to the recorder of each file, at `flush` or when many wait.
+    """Recorders of files that get every event, at `flush` or when many wait.
 
     So a registration has the processor for itself. The caller waits for files to be written, but
     not for pictures, which a thread draws while the session goes on: an error of theirs is raised
@@ -53,7 +53,7 @@ class Recorders(Recorder):
         live: bool = False,
         optional: str = "",
     ) -> None:
-        """live: hand over every event at once.
+        """Start a recorder of files and pictures. live: hand over every event at once.
 
         optional: what to do about pictures that cannot be drawn. Where this is given, a
         RecordingError of theirs is a warning that ends with it, and no more is drawn.

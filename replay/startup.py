@@ -31,7 +31,7 @@ EXTRAS = {
 
 
 def begin() -> None:
-    """For a command, before its imports: Ctrl-C ends it at once, and `chsel` must be ours.
+    """Begin a command, before its imports: Ctrl-C ends it at once, and `chsel` must be ours.
 
     A console script imports nothing from the current folder, nor does a Python that it starts. A
     module of an extra that is not installed is an error of one line.
@@ -66,13 +66,13 @@ def _name_missing_extra(
 
 
 def ready() -> None:
-    """Imports are done: Ctrl-C raises KeyboardInterrupt again, unless it is ignored."""
+    """End the imports: Ctrl-C raises KeyboardInterrupt, unless it is ignored."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def package_version(package: str = "chsel-replay") -> str:
-    """The version of an installed package, "not installed" without one."""
+    """Return the version of an installed package, "not installed" without one."""
     import importlib.metadata  # a third of what `python -m replay --help` would take
 
     try:

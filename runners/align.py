@@ -52,7 +52,7 @@ class AlignConfig(SourceConfig):
             )
 
     def guess(self) -> FloatArray:
-        """world_from_object (4, 4) as a person gave it."""
+        """Return world_from_object (4, 4) as a person gave it."""
         if self.pose is not None:
             return read_pose(self.pose)
         rotation = roll_pitch_yaw(np.array(self.rotation or (0.0, 0.0, 0.0)))
@@ -122,7 +122,7 @@ def _apart(distance: dict[str, float]) -> str:
 def _warnings(
     pose: FloatArray, guess: FloatArray, numbers: dict[str, Any], search: TruePoseSettings
 ) -> list[str]:
-    """What speaks against the result."""
+    """Return reasons against the result."""
     offset, turned = np.abs(pose[:3, 3] - guess[:3, 3]), numbers["from_guess"]["rotation"]
     axis, tolerance = "xyz"[int(np.argmax(offset))], 1000.0 * search.cost.tolerance
     doubts = (

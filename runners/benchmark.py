@@ -55,7 +55,7 @@ class BenchmarkConfig:
             require_choice("alone", measure, MEASURES)
 
     def shortened(self) -> BenchmarkConfig:
-        """As much as takes under a minute; its times are not to be quoted."""
+        """Return a configuration of less than a minute, whose times are not to be quoted."""
         return replace(
             self,
             problems=("real_20",),
@@ -104,7 +104,7 @@ def main(config: DictConfig) -> None:
 def _measures(
     config: BenchmarkConfig, package: PublishedPackage | None
 ) -> Iterator[tuple[str, Iterator[Row]]]:
-    """What is to be measured, by name; rows are measured as they are taken."""
+    """Yield the measurements by name; rows are measured as they are taken."""
     scope = Scope(config.steps, config.repeats, config.seed)
     for name in config.problems:
         yield name, compare(name, scope, package, equation=name in config.package.equation)

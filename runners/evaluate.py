@@ -141,7 +141,7 @@ def evaluate(plan: Plan, trials: list[Trial], config: EvaluateConfig, console: C
 
 def _plan(config: EvaluateConfig) -> Plan:
     def path(folder: object) -> Path:
-        """As workers elsewhere find it."""
+        """Return the path of a folder as workers on other machines find it."""
         return Path(str(folder)).expanduser().absolute()
 
     policies = chosen_policies(config.policies, config.policy)
@@ -169,7 +169,7 @@ def _plan(config: EvaluateConfig) -> Plan:
 
 
 def _check(plan: Plan, trials: list[Trial], levels: tuple[str, ...]) -> None:
-    """What would fail everywhere fails here, before any work."""
+    """Raise the errors that all trials would have, before any work."""
     of_policies = (len(plan.contenders), plan.kind == SENSORS, plan.starts, plan.steps, plan.every)
     if plan.policies and (of_policies != (1, False, OWN, None, None) or plan.outside):
         raise SettingError(

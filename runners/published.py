@@ -60,7 +60,7 @@ class PublishedConfig:
 
     @property
     def folder(self) -> Path:
-        """Of the sets."""
+        """Folder of the sets."""
         evaluation = Path(self.dir or "").expanduser()
         return Path(self.out).expanduser() if self.out else evaluation / "package"
 
@@ -102,9 +102,9 @@ def main(config: DictConfig) -> None:
 
 
 def found_trials(config: PublishedConfig) -> list[tuple[Trial, Path]]:
-    """Trials with a finished session and its recording, seed by seed.
+    """Return trials with a finished session and its recording, seed by seed.
 
-    Raises SettingError if the settings name none.
+    Raise SettingError if the settings name none.
     """
     folder = Path(config.dir or "").expanduser()
     experiment = read_experiment(folder)
@@ -124,21 +124,18 @@ def found_trials(config: PublishedConfig) -> list[tuple[Trial, Path]]:
 
 @dataclass(frozen=True)
 class PackageSession:
-    """One draw of a trial: what registers it, and the files of what is found, in a folder of sets.
-
-    session: the trial's recording. steps: those to register.
-    """
+    """One draw of a trial, registered by the package, and the files of its results."""
 
     package: PublishedPackage
-    folder: Path
+    folder: Path  # of all sets
     trial: Trial
     draw: int
-    session: Path
-    steps: tuple[int, ...]
+    session: Path  # the trial's recording
+    steps: tuple[int, ...]  # those to register
 
     @property
     def unit(self) -> Task:
-        """As progress names it."""
+        """The task, as progress names it."""
         return Task(self.trial, repeat_label("package", self.draw))
 
     @property
@@ -149,11 +146,11 @@ class PackageSession:
 
     @property
     def about(self) -> Path:
-        """How the sets came about, and why steps have none; written last."""
+        """File of how the sets came about, and why steps have none; written last."""
         return self.sets.with_suffix(".about.json")
 
     def failures(self) -> Mapping[str, str] | None:
-        """Why steps have no set; None if the sets are not there, or of another session or version.
+        """Return why steps have no set; None if the sets are missing or of another session.
 
         A file that cannot be read is made again.
         """
@@ -164,7 +161,7 @@ class PackageSession:
         return None
 
     def register(self) -> Iterator[int]:
-        """Yields each step when the package is done with it; the files are there at the end."""
+        """Yield each step when the package is done with it; the files exist at the end."""
         session = RecordedSession(RecordedSettings(str(self.session), 0, 0))
         arrays: dict[str, Any] = {}
         about: dict[str, Any] = {"failed": {}, "cpu_seconds": {}, "free_points": {}}
@@ -206,7 +203,7 @@ class PackageSession:
 def registered(
     package: PublishedPackage, problem: RegistrationProblem, mesh: trimesh.Trimesh
 ) -> tuple[Hypotheses, Mapping[str, Any]]:
-    """What the package finds with its own settings, best first, and its whole answer."""
+    """Return the hypotheses of the package with its own settings, best first, and its answer."""
     package.load(problem, mesh.bounds)
     # It draws from generators of its own, of one number that follows from ours.
     seed = int(problem.key.stream(Purpose.EMITTER).integers(2**32))

@@ -44,7 +44,7 @@ from runners.sensors.depth_frame import SUFFIXES as FRAMES
 from runners.sessions.problem_source import open_source
 
 MADE = "made.json"
-"""What made results.csv, beside it."""
+"""Name of the file beside results.csv that says how that was made."""
 _RIGHT = (0.005, pi / 36.0)  # m and radians (5 degrees): errors of a hypothesis that is right
 _EPSILON = 0.001  # m, of plausible sets, which are not made here
 _SPLIT = 1  # the random stream, of a seed, that halves the touches
@@ -119,7 +119,7 @@ class RealCase:
     """A case with its object, its points and, where it is known, its true pose."""
 
     def __init__(self, config: RealConfig, name: str) -> None:
-        """Raises SettingError if there are too few touches, and what opening a session raises."""
+        """Open the session; raise SettingError if there are too few touches."""
         case = build_settings(CaseConfig, config.cases[name], f"cases.{name}")
         folder = Path(config.data or "").expanduser() / "real"
         model = {"name": name, "scale": 1.0, "epsilon": _EPSILON, "configuration": name}
@@ -134,7 +134,7 @@ class RealCase:
         self._symmetry, self._config, self._name = object_symmetry(self._source.mesh), config, name
 
     def rows(self, methods: Mapping[str, Method], seeds: Sequence[int]) -> Iterator[dict[str, Any]]:
-        """A row for every method and seed and, where wanted, another of its half of the touches.
+        """Yield a row for every method and seed and, where wanted, another of half of the touches.
 
         Last one of the true pose itself, where it is known: what residual there is to reach.
         """
@@ -152,7 +152,7 @@ class RealCase:
             yield about | self._counts(every, inverse(truth[None])[0])
 
     def _counts(self, kept: IntArray, pose: FloatArray) -> dict[str, Any]:
-        """Numbers of points, and how far all touches are from the surface in a pose (4, 4)."""
+        """Return numbers of points, and the distances of all touches from the surface in a pose."""
         away = np.abs(mesh_sdf(self._source.mesh, apply(pose, self._touches))[0])  # (C,), metres
         rest = np.delete(np.arange(len(away)), kept)
         return {
@@ -164,7 +164,7 @@ class RealCase:
         }
 
     def _numbers(self, method: Method, seed: int, kept: IntArray) -> dict[str, Any]:
-        """What comes of registering these of the touches; lengths in metres, angles in radians."""
+        """Return the numbers of registering these touches; metres and radians."""
         given = self._given
         points = KnownPoints(free=given.points.free, known=self._touches[kept])
         problem = posed_problem(
@@ -191,7 +191,7 @@ class RealCase:
 
 
 def medians(rows: pd.DataFrame) -> Table:
-    """Medians over seeds of every case and method."""
+    """Return medians over seeds of every case and method."""
     lines = []
     for (case, method), own in rows.groupby(["case", "method"], sort=False):
         every = own[own["points"] == _ALL]

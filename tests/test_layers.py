@@ -1,3 +1,5 @@
+"""Which package and folder may import which, by the tables of docs/architecture.md."""
+
 import ast
 import re
 from collections import Counter

@@ -105,7 +105,8 @@ def test_the_sdist_has_the_checkout_without_its_tests(built):
         names = {name.partition("/")[2] for name in archive.getnames()}
     listed = subprocess.run(["git", "ls-files"], cwd=REPOSITORY, capture_output=True, text=True)
     left_out = {name.partition("/")[0] for name in set(listed.stdout.split()) - names}
-    assert left_out == {".ci", ".gitignore", "findings", "logs", "tests"}
+    settings = {".ci", ".gitignore", ".pre-commit-config.yaml"}
+    assert left_out == settings | {"findings", "logs", "tests"}
     assert not {name for name in names if name.startswith("tests")}
 
 

@@ -1,4 +1,4 @@
-"""`python -m docs.results.make`: docs/results.md, docs/benchmark.md and the README's numbers.
+"""`python -m docs.results.make`: the pages of docs/ with results, and the README's numbers.
 
 python -m docs.results.make                   write the pages from the tables in runners/results
 python -m docs.results.make store FOLDER ...  put evaluations there first, under their names
@@ -31,7 +31,8 @@ from runners.reporting.tables import Table, number, percent, percent_range, with
 from runners.sessions.faults import LEVELS
 
 HERE, DOCS = Path(__file__).parent, Path(__file__).parents[1]
-PAGES = {HERE / f"{name}.md.j2": DOCS / f"{name}.md" for name in ("results", "benchmark")}
+_NAMES = ("results", "results_paper", "results_probing", "benchmark")
+PAGES = {HERE / f"{name}.md.j2": DOCS / f"{name}.md" for name in _NAMES}
 README = DOCS.parent / "README.md"
 _BLOCK = re.compile(r"(<!-- ([a-z_]+) of docs/results -->\n).*?(<!-- end -->)", re.DOTALL)
 REAL = "real"  # results of runners.real

@@ -25,7 +25,7 @@ Made = TypeVar("Made")
 
 
 class Choosable(NamedTuple, Generic[Made]):
-    """What can be chosen by name and settings."""
+    """A kind of thing that is chosen by name and settings: methods, or policies."""
 
     name: str  # also of its group in a session's configuration
     names: tuple[str, ...]
@@ -50,26 +50,26 @@ class Choice(Generic[Made]):
 
     @property
     def config(self) -> dict[str, Any]:
-        """As the configuration of a recording has it."""
+        """Name and settings in the form of a recording's configuration."""
         return {"name": self.name, **settings_mapping(self.settings)}
 
     def build(self) -> Made:
-        """The method or policy itself."""
+        """Return the method or policy itself."""
         return self.kind.build(self.name, self.settings)
 
 
 def recorded_method(recording: Recording) -> Choice[Method]:
-    """The method of a recording; RecordingError without its settings, or if it does not exist."""
+    """Return the recorded method; raise RecordingError without settings, or if it is unknown."""
     return _recorded(recording, METHOD)
 
 
 def recorded_policy(recording: Recording) -> Choice[Policy]:
-    """The policy that steered a session; RecordingError if none did, or it is not installed."""
+    """Return the policy that steered; raise RecordingError if none did, or it is not installed."""
     return _recorded(recording, POLICY)
 
 
 def is_recorded(recording: Recording, choice: Choice[Any]) -> bool:
-    """Whether name and settings are those of the recording."""
+    """Return whether name and settings are those of the recording."""
     try:
         return choice.config == _recorded(recording, choice.kind).config
     except RecordingError:
@@ -77,11 +77,11 @@ def is_recorded(recording: Recording, choice: Choice[Any]) -> bool:
 
 
 def chosen(recording: Recording, kind: Choosable[Made], words: Sequence[str]) -> list[Choice[Made]]:
-    """Methods or policies by labels such as "chsel", "chsel@paper" or "chsel#small", and changes.
+    """Return methods or policies by labels such as "chsel@paper" or "chsel#small", and changes.
 
     Without a preset, settings are those of the recording for its own method or policy, else those
     of its preset. A change "KEY=VALUE" applies to every label that has the setting,
-    "LABEL:KEY=VALUE" to one. Raises SettingError for what does not exist, or fits no label.
+    "LABEL:KEY=VALUE" to one. Raise SettingError for what does not exist, or fits no label.
     """
     labels = [word for word in words if "=" not in word]
     if not labels:
@@ -114,7 +114,7 @@ def _recorded(recording: Recording, kind: Choosable[Made]) -> Choice[Made]:
 
 
 def _choice(recording: Recording, kind: Choosable[Made], label: str) -> Choice[Made]:
-    """What a label names, before any change."""
+    """Return the choice that a label names, before any change."""
     match = _LABEL.fullmatch(label)
     if match is None:
         raise SettingError(f"{label!r} is not a {kind.name}; accepted: {LABELS_HELP}")
@@ -158,7 +158,7 @@ def _change(choices: dict[str, Choice[Made]], kind: Choosable[Made], word: str) 
 
 
 def _has(settings: Any, keys: Sequence[str]) -> bool:
-    """Whether settings have one by the names of its groups and its own."""
+    """Return whether settings have a setting of this path."""
     for key in keys:
         if not hasattr(settings, key):
             return False

@@ -68,12 +68,12 @@ COLUMNS: Mapping[str, Column] = {
     "diversity": Column("diversity_mm2", "plausible diversity, mm²", "PD\nmm²"),
     "seconds": Column("seconds_s", "time, ms", "ms", 1e3),
 }
-"""All numbers by the names that `Outcome.numbers` has, in the order in which they are shown."""
+"""Columns by the names of `Outcome.numbers`, in the order in which they are shown."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What one method, or the recording, has for one step."""
+    """The result of one method, or of the recording, at one step."""
 
     step: int
     label: str
@@ -87,14 +87,14 @@ class Outcome:
 
 @dataclass(frozen=True)
 class CommonCost:
-    """The one cost that the hypotheses of all methods are judged by; name: for people."""
+    """The one cost by which the hypotheses of all methods are judged."""
 
     settings: CostSettings
-    name: str
+    name: str  # for people
 
 
 def common_cost(recording: Recording) -> CommonCost:
-    """The cost of the recorded method; that of the default preset if the recording has none."""
+    """Return the cost of the recorded method, or that of the default preset if it has none."""
     settings = None
     with suppress(RecordingError):
         method = recorded_method(recording)
@@ -108,7 +108,7 @@ def common_cost(recording: Recording) -> CommonCost:
 
 
 def recorded_label(recording: Recording) -> str:
-    """How the row of the recorded result is called."""
+    """Return the label of the row of the recorded result."""
     return f"recorded: {recording.start.method}"
 
 
@@ -121,7 +121,7 @@ def compared(
     *,
     out: Path | None = None,
 ) -> Iterator[Outcome]:
-    """Outcomes step by step: the recorded one, then one of each method in turn.
+    """Yield outcomes step by step: the recorded one, then one of each method in turn.
 
     plausible: the sets that hypotheses are also measured by. out: where to record the registration
     of one method and one step, with all that its problem follows from. A registration that
@@ -162,7 +162,7 @@ def frame(
     cost: CommonCost,
     definition: str,
 ) -> pd.DataFrame:
-    """A row for each step and method; names of columns end in their unit.
+    """Return a row for each step and method; names of columns end in their unit.
 
     step, label, method, changes (to the settings, with "; " between), cost (by which all are
     judged), definition (of the plausible sets, empty where a row has no PD), then the numbers with
@@ -198,7 +198,7 @@ def write_csv(rows: pd.DataFrame, path: Path) -> None:
 def numbers_under(
     cost: CompiledCost, hypotheses: Hypotheses, start: SessionStarted
 ) -> dict[str, float]:
-    """Numbers about hypotheses, judged by a cost that may be another than their method's.
+    """Return numbers about hypotheses, by a cost that may be another than their method's.
 
     Best is the one of the lowest cost, closest the one whose surface is nearest to the true one.
     Errors in metres and radians, modulo the object's symmetries, at its centre.
@@ -233,7 +233,7 @@ def _all_numbers(
 
 
 def _problems(recording: Recording, steps: Sequence[int]) -> Iterator[ProblemPosed]:
-    """The problems of steps, each once."""
+    """Yield the problems of steps, each once."""
     left = set(steps)
     for event in recording.events(images=False):
         if isinstance(event, ProblemPosed) and event.step in left:
@@ -259,7 +259,7 @@ def _register(
 def _recorder(
     recording: Recording, step: int, choice: Choice[Method], out: Path | None
 ) -> Iterator[Recorder]:
-    """What records a registration: in a new file with the probes before it, or nothing."""
+    """Open the recorder of a registration: a new file with the probes before it, or none."""
     if out is None:
         yield Recorder()
         return
@@ -318,9 +318,9 @@ class PlausibleSets:
         return SurfaceDistance(start.sdf, start.mesh, points)
 
     def numbers(self, problem: RegistrationProblem, hypotheses: Hypotheses) -> dict[str, float]:
-        """Coverage, plausibility and PD in mm^2 (CHSEL, Sec. V); none without a set of the problem.
+        """Return coverage, plausibility and PD in mm^2 (CHSEL, Sec. V), nothing without a set.
 
-        Raises EvaluationError for a set that is damaged.
+        Raise EvaluationError for a set that is damaged.
         """
         members = self._members(problem)
         if members is None or len(hypotheses.object_from_world) == 0:
@@ -334,7 +334,7 @@ class PlausibleSets:
         }
 
     def _members(self, problem: RegistrationProblem) -> PlausibleSet | None:
-        """The set of these points and this object by the definition, whatever its eps."""
+        """Return the set of these points and this object by the definition, whatever its eps."""
         for path in sorted(self._folder.glob(f"{problem.points.digest}_*.npz")):
             found = read_plausible(path)
             usual = plausible_settings(self._definition, found.settings.epsilon)

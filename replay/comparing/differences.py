@@ -1,4 +1,4 @@
-"""How values and events differ to the bit, in words and in units in the last place."""
+"""Differences of values and events to the bit, in words and in units in the last place."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from chsel.events import (
 ABSENT = object()
 """Stands for a value that one side does not have."""
 RELATIVE, ABSOLUTE = 1e-9, 1e-12
-"""How far a measured number may be from the recorded one: libraries may round otherwise."""
+"""Tolerance of a measured number beside the recorded one: libraries may round otherwise."""
 
 ERRORS = 1e-4
 """m or rad: how far errors to the true pose may be, as symmetries depend on LAPACK and libigl."""
@@ -50,7 +50,7 @@ class Difference:
 
 
 def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[Difference]:
-    """What differs between two contents, in the order of the first."""
+    """Return the differences between two contents, in the order of the first."""
     pairs = (
         difference(name, first.get(name, ABSENT), second.get(name, ABSENT))
         for name in dict.fromkeys([*first, *second])
@@ -59,7 +59,7 @@ def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[Dif
 
 
 def difference(name: str, first: Any, second: Any) -> Difference | None:
-    """How two values differ, or None if they have the same type and the same bits."""
+    """Return how two values differ, or None if they have the same type and the same bits."""
     if _is_equal(first, second):
         return None
     distance = None if name.startswith(_SETTINGS) else _largest_ulps(first, second)
@@ -74,7 +74,7 @@ def difference(name: str, first: Any, second: Any) -> Difference | None:
 
 
 def ulps(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.uint64]:
-    """Steps between neighbouring doubles from each number to the other, entry by entry.
+    """Return steps between neighbouring doubles from each number to the other, entry by entry.
 
     -0.0 is right below 0.0. Of two equal NaN it is 0, as of all numbers with the same bits.
     """
@@ -93,13 +93,13 @@ def _is_equal(first: Any, second: Any) -> bool:
 
 
 def _are_alike(first: Any, second: Any) -> bool:
-    """Whether both are arrays of one type and shape."""
+    """Return whether both are arrays of one type and shape."""
     both = isinstance(first, np.ndarray) and isinstance(second, np.ndarray)
     return both and first.dtype == second.dtype and first.shape == second.shape
 
 
 def _largest_ulps(first: Any, second: Any) -> int | None:
-    """The most units in the last place between two doubles, or arrays of them of one shape."""
+    """Return the most units in the last place between doubles, or arrays of one shape."""
     if isinstance(first, float) and isinstance(second, float):
         first, second = np.array([first]), np.array([second])
     if not _are_alike(first, second) or first.dtype != np.float64:
@@ -108,7 +108,7 @@ def _largest_ulps(first: Any, second: Any) -> int | None:
 
 
 def _array_difference(first: NDArray[Any], second: NDArray[Any]) -> str:
-    """In how many entries two arrays of one type and shape differ, and where first."""
+    """Return in how many entries two arrays of one type and shape differ, and where first."""
     if first.dtype != np.float64:
         unequal = np.flatnonzero((_bytes(first) != _bytes(second)).any(axis=1))
         return f"{len(unequal)} of {first.size} entries, the first at {unequal[0]}"
@@ -123,12 +123,12 @@ def _array_difference(first: NDArray[Any], second: NDArray[Any]) -> str:
 
 
 def _bytes(entries: NDArray[Any]) -> NDArray[np.uint8]:
-    """The bytes (N, B) of each entry of an array."""
+    """Return the bytes (N, B) of each entry of an array."""
     return np.frombuffer(entries.tobytes(), dtype=np.uint8).reshape(entries.size, -1)
 
 
 def _ranks(numbers: NDArray[Any]) -> NDArray[np.uint64]:
-    """Where each number stands in the order of all doubles."""
+    """Return the rank of each number in the order of all doubles."""
     bits = np.ascontiguousarray(numbers, dtype=np.float64).view(np.uint64)
     return np.where(bits & _SIGN, ~bits, bits | _SIGN)
 
@@ -146,7 +146,7 @@ def _shown(value: Any) -> str:
 
 @dataclass
 class ResultDifferences:
-    """What differs between a recorded registration or decision and another one, stage by stage."""
+    """The differences of a registration or decision from the recorded one, stage by stage."""
 
     stage: str = ""  # the first that differs; empty if none does
     before: int = 0  # how many stages before it are equal
@@ -154,7 +154,7 @@ class ResultDifferences:
     largest_ulps: int = 0  # over all numbers in these lines
 
     def add(self, stage: str, lines: Sequence[str] = (), *, ulps: int = 0) -> None:
-        """A stage differs."""
+        """Add the lines of a stage that differs."""
         self.stage = self.stage or stage
         self.lines += lines
         self.largest_ulps = max(self.largest_ulps, ulps)
@@ -184,7 +184,7 @@ def result_differences(recorded: Sequence[Event], other: Sequence[Event]) -> Res
 
 
 def event_name(event: Event) -> tuple[str, int, str]:
-    """Topic, step, and stage and iteration of a trace or archive, or the sensor of an image.
+    """Return topic, step, and stage and iteration of a trace or archive, or the sensor of an image.
 
     Events of the same name belong together, in their order.
     """
@@ -193,15 +193,15 @@ def event_name(event: Event) -> tuple[str, int, str]:
         case Traced():
             about = f"{event.stage} iteration {event.iteration}"
         case SnapshotTaken():
-            again = event.archive.refinement
-            about = f"iteration {event.archive.iteration}" + f" (pass {again + 1})" * (again > 0)
+            passes = event.archive.refinement
+            about = f"iteration {event.archive.iteration}" + f" (pass {passes + 1})" * (passes > 0)
         case SensorImage():
             about = event.sensor
     return event.topic, event.step, about
 
 
 def content(event: Event) -> Content:
-    """All that an event says; of a problem, what no other event says."""
+    """Return all that an event says; of a problem, what no other event says."""
     parts = dict(_parts(event))
     parts.pop("step", None)
     if isinstance(event, ProblemPosed | Decided):
@@ -213,7 +213,7 @@ def content(event: Event) -> Content:
 
 
 def _stages(event: Event) -> dict[str, Content]:
-    """What a result says, by the stages in which it comes about."""
+    """Return the content of a result by the stages of its method."""
     values = content(event)
     match event:
         case ProblemPosed():
@@ -241,7 +241,7 @@ def _stages(event: Event) -> dict[str, Content]:
 
 
 def _by_stage(events: Sequence[Event]) -> dict[str, Content]:
-    """Content by a name of its stage; those of later passes are numbered."""
+    """Return content by a name of its stage; those of later passes are numbered."""
     named: dict[str, Content] = {}
     for event in events:
         for stage, values in _stages(event).items():
@@ -254,14 +254,14 @@ def _by_stage(events: Sequence[Event]) -> dict[str, Content]:
 
 
 def _out_of_tolerance(recorded: Content, other: Content) -> tuple[Content, Content]:
-    """The recorded numbers that the other lacks, or has outside their tolerance."""
+    """Return the recorded numbers that the other lacks, or has outside their tolerance."""
     far = [name for name in recorded if not is_close(recorded[name], other.get(name), name)]
     one, two = ({name: of[name] for name in far if name in of} for of in (recorded, other))
     return one, two
 
 
 def is_close(recorded: float, other: float | None, name: str) -> bool:
-    """Whether a measured number of this name may be in place of the recorded one."""
+    """Return whether a measured number of this name may be in place of the recorded one."""
     if other is None:
         return False
     absolute = ERRORS if name.endswith("_error") else ABSOLUTE
@@ -270,7 +270,7 @@ def is_close(recorded: float, other: float | None, name: str) -> bool:
 
 
 def _parts(value: Any) -> Iterator[tuple[str, Any]]:
-    """The fields of a value that has some."""
+    """Yield the fields of a value that has some."""
     if hasattr(value, "vertices"):  # a mesh or hand, which have more than these
         yield "vertices", np.asarray(value.vertices)
         yield "faces", np.asarray(value.faces)
@@ -283,7 +283,7 @@ def _parts(value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """What is at the ends of nested values, with its path."""
+    """Yield the leaves of nested values, with their paths."""
     parts = list(_parts(value))
     for name, inner in parts:
         dot = "." if path and not name.startswith("[") else ""

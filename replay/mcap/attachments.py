@@ -1,4 +1,4 @@
-"""What stands once in a recording, beside its messages: the object's mesh and its SDF grid."""
+"""The attachments of a recording: the object's mesh and its SDF grid."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _LONGEST_HEADER = len(_HEADER) + 20
 
 
 def mesh_to_ply(mesh: trimesh.Trimesh) -> bytes:
-    """Vertices and faces of a mesh as a PLY file with float64 coordinates; exact."""
+    """Return vertices and faces of a mesh as a PLY file with float64 coordinates; exact."""
     vertices = np.ascontiguousarray(mesh.vertices, "<f8")
     check_mesh(vertices, mesh.faces)
     faces = np.zeros(len(mesh.faces), _FACE)
@@ -50,7 +50,7 @@ def mesh_to_ply(mesh: trimesh.Trimesh) -> bytes:
 
 
 def mesh_from_ply(data: bytes) -> trimesh.Trimesh:
-    """The mesh that `mesh_to_ply` wrote; RecordingError for any other file."""
+    """Return the mesh that `mesh_to_ply` wrote; raise RecordingError for any other file."""
     import trimesh
 
     header = re.match(_HEADER_PATTERN.encode(), data[:_LONGEST_HEADER])
@@ -70,14 +70,14 @@ def mesh_from_ply(data: bytes) -> trimesh.Trimesh:
 
 
 def mesh_attached(attachments: Mapping[str, bytes], digest: str) -> trimesh.Trimesh:
-    """The mesh among attachments; RecordingError unless it is there and has the digest."""
+    """Return the mesh among attachments; raise RecordingError unless it has the digest."""
     mesh = mesh_from_ply(_data(attachments, MESH))
     check_digest(f"attachment {MESH}", mesh_digest(mesh), digest)
     return mesh
 
 
 def sdf_attached(attachments: Mapping[str, bytes], digest: str) -> SdfGrid:
-    """The SDF grid among attachments, likewise."""
+    """Return the SDF grid among attachments, likewise."""
     sdf = SdfGrid(**decode("SdfGrid", _data(attachments, SDF_GRID)))
     check_digest(f"attachment {SDF_GRID}", sdf.digest, digest)
     return sdf
@@ -90,6 +90,6 @@ def _data(attachments: Mapping[str, bytes], name: str) -> bytes:
 
 
 def sdf_to_bytes(sdf: SdfGrid) -> bytes:
-    """A grid as a protobuf message; exact."""
+    """Return a grid as a protobuf message; exact."""
     fields = ("origin", "resolution", "values", "gradients")
     return encode("SdfGrid", {name: getattr(sdf, name) for name in fields})

@@ -33,7 +33,7 @@ class Kind:
     optional: bool
     checks: tuple[Check, ...]
     dtype: np.dtype[Any] | None
-    """Of an array; None for all else."""
+    """Type of the entries of an array; None for all else."""
     shape: tuple[str, ...]
     """Lengths of an array: numbers, or letters."""
     narrow: bool
@@ -50,7 +50,7 @@ class Kind:
 
 @cache
 def field_kinds(name: str) -> dict[str, Kind]:
-    """The fields of a message, taken apart."""
+    """Return the fields of a message, taken apart."""
     kinds = {}
     for field, entry in MESSAGES[name].items():
         text, *checks = (entry,) if isinstance(entry, str) else entry
@@ -70,12 +70,12 @@ def field_kinds(name: str) -> dict[str, Kind]:
 
 
 def shared_values(message: str, source: object) -> dict[str, Any]:
-    """The fields of a message that a value has as attributes."""
+    """Return the fields of a message that a value has as attributes."""
     return {name: getattr(source, name) for name in MESSAGES[message] if hasattr(source, name)}
 
 
 def shared_arguments(kind: type, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a dataclass that a message has, too."""
+    """Return the fields of a dataclass that a message has, too."""
     return {field.name: values[field.name] for field in fields(kind) if field.name in values}
 
 
@@ -92,9 +92,9 @@ def check_message(name: str, values: Mapping[str, Any]) -> None:
 
 
 def encode(name: str, values: Mapping[str, Any]) -> bytes:
-    """The bytes of a message, from a value for each of its fields.
+    """Return the bytes of a message, from a value for each of its fields.
 
-    Raises RecordingError if a value does not have the type or shape that the table gives.
+    Raise RecordingError if a value does not have the type or shape that the table gives.
     """
     message: Any = message_class(name)()
     _fill(message, name, values)
@@ -103,15 +103,15 @@ def encode(name: str, values: Mapping[str, Any]) -> bytes:
 
 
 def decode(name: str, data: bytes) -> dict[str, Any]:
-    """The values of a message's fields; arrays are read-only, absent fields are None.
+    """Return the values of a message's fields; arrays are read-only, absent fields are None.
 
-    Raises RecordingError if the bytes are no such message or an array is not as the table says.
+    Raise RecordingError if the bytes are no such message or an array is not as the table says.
     """
     return _values(parsed(message_class(name), data), name)
 
 
 def parsed(kind: Any, data: bytes) -> Any:
-    """The message of a protobuf class in bytes; RecordingError if they are no such message."""
+    """Return the message of a protobuf class; raise RecordingError if the bytes are none."""
     try:
         return kind.FromString(data)
     except DecodeError:
@@ -120,12 +120,12 @@ def parsed(kind: Any, data: bytes) -> Any:
 
 @cache
 def message_class(name: str) -> type[Message]:
-    """The protobuf class of a message of the table."""
+    """Return the protobuf class of a message of the table."""
     return message_factory.GetMessageClass(_pool().FindMessageTypeByName(f"{PACKAGE}.{name}"))
 
 
 def descriptor_set(message: type[Message]) -> bytes:
-    """All that a reader without this code needs to decode a message: a FileDescriptorSet."""
+    """Return a FileDescriptorSet: all that a reader needs to decode a message."""
     files: dict[str, Any] = {}
 
     def visit(file: Any) -> None:
@@ -216,7 +216,7 @@ def _get(message: Any, where: str, field: str, kind: Kind, lengths: dict[str, in
 
 
 def _array(where: str, kind: Kind, message: Any, lengths: dict[str, int]) -> np.ndarray:
-    """The array in an Array message, in the machine's byte order; read-only."""
+    """Return the array of an Array message, in the machine's byte order; read-only."""
     wide, data = kind.dtype, message.data
     assert wide is not None
     shape = tuple(message.shape)
@@ -253,7 +253,7 @@ def _check_array(
 
 @cache
 def _pool() -> descriptor_pool.DescriptorPool:
-    """All messages of the table, one file each, in a pool of their own."""
+    """Return all messages of the table, one file each, in a pool of their own."""
     pool = descriptor_pool.DescriptorPool()
     for name in MESSAGES:
         pool.Add(_file(name))
@@ -261,7 +261,7 @@ def _pool() -> descriptor_pool.DescriptorPool:
 
 
 def _file(name: str) -> descriptor_pb2.FileDescriptorProto:
-    """The .proto file of one message."""
+    """Return the .proto file of one message."""
     file = descriptor_pb2.FileDescriptorProto(
         name=_path(name), package=PACKAGE, syntax="proto3", message_type=[{"name": name}]
     )

@@ -49,7 +49,7 @@ _VALUE = np.dtype("<u2")
 
 
 def event_values(event: Event) -> dict[str, Any]:
-    """An event as its message has it; results may repeat an archive, see `McapRecorder`."""
+    """Return an event as its message has it; results may repeat an archive, see `McapRecorder`."""
     match event:
         case SessionStarted():
             return _session_values(event)
@@ -70,7 +70,7 @@ def event_values(event: Event) -> dict[str, Any]:
 
 
 def event_from(topic: str, values: Mapping[str, Any]) -> Event:
-    """The event of a message that is all of it."""
+    """Return the event of a message that is all of it."""
     kind = EVENTS[topic]
     if kind is RigDescribed:
         return _rig_from(values)
@@ -80,7 +80,7 @@ def event_from(topic: str, values: Mapping[str, Any]) -> Event:
 
 
 def step_numbers(event: Event) -> dict[str, float]:
-    """The numbers of an event, by their names: scalar fields, and mappings to numbers."""
+    """Return the numbers of an event, by their names: scalar fields, and mappings to numbers."""
     numbers: dict[str, float] = {}
     for name, value in event_values(event).items():
         if isinstance(value, Mapping):
@@ -91,7 +91,7 @@ def step_numbers(event: Event) -> dict[str, float]:
 
 
 def _session_values(event: SessionStarted) -> dict[str, Any]:
-    """The message `Session`."""
+    """Return the message `Session`."""
     try:
         config = json.dumps(dict(event.config), ensure_ascii=False, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -110,7 +110,7 @@ def _session_values(event: SessionStarted) -> dict[str, Any]:
 def session_from(
     values: Mapping[str, Any], points: KnownPoints, mesh: trimesh.Trimesh, sdf: SdfGrid
 ) -> SessionStarted:
-    """The start of a session, with its points and attachments."""
+    """Return the start of a session, with its points and attachments."""
     parts = {
         "config": config_from_json(values["config"]),
         "workspace": _workspace_from(values),
@@ -140,7 +140,7 @@ def _start_from(values: Mapping[str, Any] | None) -> Start | None:
 
 
 def config_from_json(text: str) -> dict[str, Any]:
-    """The configuration of a session; RecordingError if it is no mapping in JSON."""
+    """Return the configuration of a session; raise RecordingError if it is no mapping in JSON."""
     try:
         config = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -151,7 +151,7 @@ def config_from_json(text: str) -> dict[str, Any]:
 
 
 def _problem_values(event: ProblemPosed) -> dict[str, Any]:
-    """The message `Problem`, with its low-cost set."""
+    """Return the message `Problem`, with its low-cost set."""
     problem = event.problem
     pushes = problem.pushes
     return shared_values("Problem", problem) | {
@@ -175,16 +175,16 @@ class RecordedProblem:
 
     @property
     def step(self) -> int:
-        """Of the registration."""
+        """Step of the registration."""
         return int(self.values["step"])
 
     @property
     def seed(self) -> int:
-        """Of the random streams."""
+        """Seed of the random streams."""
         return int(self.values["key_seed"])
 
     def completed(self, sdf: SdfGrid, points: KnownPoints) -> RegistrationProblem:
-        """The whole problem; RecordingError unless it is the one that was recorded."""
+        """Return the whole problem; raise RecordingError unless it is the recorded one."""
         values = self.values
         parts = {
             "workspace": _workspace_from(values),
@@ -200,19 +200,19 @@ class RecordedProblem:
 
 
 def archive_values(step: int, archive: ArchiveSnapshot) -> dict[str, Any]:
-    """The message `ArchiveSnapshot`."""
+    """Return the message `ArchiveSnapshot`."""
     return {"step": step} | shared_values("ArchiveSnapshot", archive)
 
 
 def archive_from(values: Mapping[str, Any]) -> ArchiveSnapshot:
-    """The archive in a message; RecordingError unless it has its digest."""
+    """Return the archive in a message; raise RecordingError unless it has its digest."""
     archive = ArchiveSnapshot(**shared_arguments(ArchiveSnapshot, values))
     check_digest(f"an archive of step {values['step']}", archive.digest, values["digest"])
     return archive
 
 
 def _rig_values(event: RigDescribed) -> dict[str, Any]:
-    """The message `Rig`."""
+    """Return the message `Rig`."""
     hand = event.hand
     return shared_values("Rig", event) | {
         "hand_vertices": None if hand is None else np.asarray(hand.vertices, np.float64),
@@ -221,7 +221,7 @@ def _rig_values(event: RigDescribed) -> dict[str, Any]:
 
 
 def _rig_from(values: Mapping[str, Any]) -> RigDescribed:
-    """The rig of a message `Rig`."""
+    """Return the rig of a message `Rig`."""
     import trimesh
 
     hand = None
@@ -233,7 +233,7 @@ def _rig_from(values: Mapping[str, Any]) -> RigDescribed:
 
 @dataclass(frozen=True)
 class ImagePlace:
-    """Where an image of a sensor stands among the events: its pixels are read when they matter."""
+    """The place of a sensor's image among the events; its pixels are read when they matter."""
 
     topic = SensorImage.topic
 
@@ -241,7 +241,7 @@ class ImagePlace:
 
 
 def image_values(event: SensorImage) -> dict[str, Any]:
-    """The message `SensorImage`; RecordingError if its pixels are of another type or shape."""
+    """Return the message `SensorImage`; raise RecordingError for pixels of another shape."""
     values, mask = event.values, event.mask
     if values.dtype != np.uint16 or values.ndim != 2:
         raise RecordingError(
@@ -260,9 +260,9 @@ def image_values(event: SensorImage) -> dict[str, Any]:
 
 
 def image_from(values: Mapping[str, Any]) -> SensorImage:
-    """The image of a message `SensorImage`; its arrays are read-only.
+    """Return the image of a message `SensorImage`; its arrays are read-only.
 
-    Raises RecordingError if it is not as the table accepts it, or has not as many pixels as it
+    Raise RecordingError if it is not as the table accepts it, or has not as many pixels as it
     says.
     """
     check_message("SensorImage", values)
@@ -289,7 +289,7 @@ def image_from(values: Mapping[str, Any]) -> SensorImage:
 
 
 def _offered_values(event: ActionsOffered) -> dict[str, Any]:
-    """The message `Actions`."""
+    """Return the message `Actions`."""
     return shared_values("Actions", event.actions) | {
         "step": event.step,
         "hand_vertices": event.hand.vertices,
@@ -299,7 +299,7 @@ def _offered_values(event: ActionsOffered) -> dict[str, Any]:
 
 
 def _offered_from(values: Mapping[str, Any]) -> ActionsOffered:
-    """The actions in a message; RecordingError unless they have their digest."""
+    """Return the actions in a message; raise RecordingError unless they have their digest."""
     actions = Actions(**shared_arguments(Actions, values))
     hand = HandShape(values["hand_vertices"], values["hand_faces"])
     event = ActionsOffered(values["step"], actions, hand)
@@ -313,7 +313,7 @@ def _digest_of(event: ActionsOffered) -> str:
 
 
 def _decision_values(event: Decided) -> dict[str, Any]:
-    """The message `Decision`."""
+    """Return the message `Decision`."""
     problem = event.problem
     return shared_values("Decision", event.decision) | {
         "step": event.step,
@@ -339,13 +339,13 @@ class RecordedDecision:
 
     @property
     def step(self) -> int:
-        """Which it follows."""
+        """Step of the registration that the decision follows."""
         return int(self.values["step"])
 
     def completed(
         self, start: SessionStarted, offered: ActionsOffered, points: KnownPoints
     ) -> Decided:
-        """With its problem, from all points so far; RecordingError unless that was recorded."""
+        """Return it with its whole problem; raise RecordingError unless that was recorded."""
         values = self.values
         problem = DecisionProblem(
             sdf=start.sdf,
@@ -365,12 +365,12 @@ class RecordedDecision:
 
 
 def decision_from(values: Mapping[str, Any]) -> RecordedDecision:
-    """The decision in a message; RecordingError unless it has its digest."""
+    """Return the decision in a message; raise RecordingError unless it has its digest."""
     decision = Decision(**shared_arguments(Decision, values))
     check_digest(f"the decision of step {values['step']}", decision.digest, values["digest"])
     return RecordedDecision(values, decision)
 
 
 def _workspace_from(values: Mapping[str, Any]) -> Workspace:
-    """The workspace of a message."""
+    """Return the workspace of a message."""
     return Workspace(*values["workspace"].tolist())

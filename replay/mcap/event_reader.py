@@ -33,11 +33,11 @@ Entry = Event | RecordedProblem | RecordedDecision | ImagePlace
 
 
 class EventReader:
-    """Joins messages to events. `within` is the topic of an event whose points are yet to come."""
+    """A reader that joins messages to events."""
 
     def __init__(self, attachments: Mapping[str, bytes]) -> None:
-        """attachments: those of the file by name, there when its first message is."""
-        self.within: str | None = None
+        """Start before any event. attachments: those of the file by name, there at its first."""
+        self.within: str | None = None  # topic of an event whose points are yet to come
         self._attachments = attachments
         self._order = EventOrder()
         self._started = False
@@ -49,7 +49,7 @@ class EventReader:
         self._last_elites: FloatArray | None = None
 
     def take(self, message: StoredMessage) -> Entry | None:
-        """The event that a message completes. RecordingError if it is malformed or out of place."""
+        """Return the event that a message completes; raise RecordingError if it is out of place."""
         topic, data = message.topic, message.data
         if topic in VIEWS:
             return None
@@ -77,13 +77,13 @@ class EventReader:
         return entry
 
     def skip(self) -> None:
-        """Messages are missing here: what they belong to is lost."""
+        """Drop the event that missing messages belong to."""
         self.within, self._opening, self._counts = None, {}, None
         self._clouds.clear()
         self._last_snapshot = None
 
     def _fits(self, topic: str) -> bool:
-        """Whether a message on this topic can follow the ones before it."""
+        """Return whether a message on this topic can follow the ones before it."""
         if self.within is not None:
             return topic == "/known_points" or (topic in CLOUDS and topic not in self._clouds)
         if not self._started:
@@ -109,7 +109,7 @@ class EventReader:
                 return event_from(topic, values)
 
     def _close(self, values: dict[str, Any]) -> SessionStarted | Probe:
-        """The event that was open, now that its points are there."""
+        """Return the event that was open, now that its points are there."""
         clouds = {
             topic: self._clouds.pop(topic, np.zeros((0, columns)))
             for topic, columns in CLOUDS.items()

@@ -33,7 +33,7 @@ MALFORMED = (
     OverflowError,
     MemoryError,
 )
-"""What reading records may raise."""
+"""Errors of reading records."""
 
 COMPRESSIONS = ("", "zstd", "lz4")  # of chunks that are read
 ACCEPTED = "accepted: a recording.mcap that this project wrote"
@@ -50,12 +50,12 @@ class DamagedRecordingError(RecordingError):
 
 
 def recover_hint(path: Path) -> str:
-    """The command that saves what is whole of a file."""
+    """Return the command that saves what is whole of a file."""
     return f"`python -m replay recover {shlex.quote(str(path))} -o OUT` saves what is whole"
 
 
 def file_records(file: IO[bytes], size: int) -> Iterator[McapRecord]:
-    """The records of a file, chunks as they are, up to its footer.
+    """Yield the records of a file, chunks as they are, up to its footer.
 
     Raises any of MALFORMED at the first damage, also if the checksum of all data is wrong.
     """
@@ -65,7 +65,7 @@ def file_records(file: IO[bytes], size: int) -> Iterator[McapRecord]:
 
 
 def chunk_at(file: IO[bytes], size: int, place: int) -> Chunk:
-    """The chunk at a place; any of MALFORMED if there is none."""
+    """Return the chunk at a place; raise one of MALFORMED if there is none."""
     file.seek(place)
     reader = StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=size)
     record = next(reader.records, None)
@@ -75,12 +75,12 @@ def chunk_at(file: IO[bytes], size: int, place: int) -> Chunk:
 
 
 def unknown_compression(name: str) -> str:
-    """What is wrong with a chunk whose compression is not read."""
+    """Return the error text of a chunk whose compression is not read."""
     return f"a chunk is compressed by {one_line(name)!r}; accepted: zstd, lz4, or none"
 
 
 def unpacked(chunk: Chunk) -> list[McapRecord]:
-    """The records in a chunk; any of MALFORMED if it is not whole, or larger than is plausible."""
+    """Return the records of a chunk; raise one of MALFORMED if it is damaged or too large."""
     if chunk.compression not in COMPRESSIONS:  # the package takes its bytes as they are
         raise ValueError(unknown_compression(chunk.compression))
     size = chunk.uncompressed_size
@@ -92,7 +92,7 @@ def unpacked(chunk: Chunk) -> list[McapRecord]:
 
 
 def file_summary(file: IO[bytes], size: int) -> Summary | None:
-    """The summary at the end of a finished file; None if there is none that is whole."""
+    """Return the summary at the end of a finished file; None if there is none that is whole."""
     try:
         file.seek(size - len(MCAP0_MAGIC) - _FOOTER.size)
         start, _, checksum = _FOOTER.unpack(file.read(_FOOTER.size))
@@ -106,7 +106,7 @@ def file_summary(file: IO[bytes], size: int) -> Summary | None:
 
 
 def reason_of(error: BaseException) -> str:
-    """What an error says of a file, on one line; struct's speaks of our program instead."""
+    """Return one line that an error says of a file; that of struct is replaced."""
     text = "" if isinstance(error, struct.error) else one_line(str(error))
     return text or "a record is cut short"
 
@@ -121,14 +121,14 @@ class StoredMessage:
 
 
 class McapFile:
-    """Reads one recording from start to end.
+    """A recording that is read from start to end.
 
     attachments: by name, those met so far. damage: what ended a partial reading. place: bytes that
     were whole by then. count: messages so far.
     """
 
     def __init__(self, path: Path, names: Mapping[str, str], *, partial: bool = False) -> None:
-        """names: topics that matter, with the full names of their messages; others are skipped.
+        """Open no file yet. names: topics that are read, with the full names of their messages.
 
         partial: take what is whole from an unfinished or damaged file, up to the first damage.
         """
@@ -142,7 +142,7 @@ class McapFile:
         self._partial = partial
 
     def messages(self) -> Iterator[StoredMessage]:
-        """All messages in the order of writing. Raises RecordingError if the file is not valid."""
+        """Yield all messages in the order of writing; raise RecordingError for an invalid file."""
         with opened(self.path) as file:
             size = file.seek(0, 2)
             unfinished = not self._has_end(file, size)
@@ -168,7 +168,7 @@ class McapFile:
                 self._stop_at(f"damaged after byte {self.place}: the end of its data is missing")
 
     def chunk_messages(self, chunk: Chunk) -> list[StoredMessage]:
-        """The messages of a chunk that matter; any of MALFORMED unless they are the next ones."""
+        """Return the messages of a chunk; raise one of MALFORMED if some are missing."""
         found, count = [], self.count
         for record in unpacked(chunk):
             if isinstance(record, Schema):
@@ -189,7 +189,7 @@ class McapFile:
         return found
 
     def later_messages(self, chunk: Chunk) -> tuple[list[StoredMessage], int]:
-        """Those of a chunk behind damage, and how many are missing before it."""
+        """Return the messages of a chunk behind damage, and how many are missing before it."""
         first = next((r.sequence for r in unpacked(chunk) if isinstance(r, Message)), self.count)
         missing = first - self.count
         if missing < 0:
@@ -202,7 +202,7 @@ class McapFile:
             raise
 
     def _has_end(self, file: IO[bytes], size: int) -> bool:
-        """Whether a file ends as a finished one; RecordingError unless it begins as one of MCAP."""
+        """Return whether a file is finished; raise RecordingError unless it begins as MCAP."""
         file.seek(0)
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise RecordingError(f"recording {self.path} is not an MCAP file; {ACCEPTED}")
@@ -222,7 +222,7 @@ class McapFile:
 
 @contextmanager
 def opened(path: Path) -> Iterator[IO[bytes]]:
-    """A recording, open for reading; RecordingError where that fails, also later on."""
+    """Open a recording for reading; raise RecordingError where that fails, also later on."""
     refuse_special_file(f"recording {path}", path, RecordingError)
     try:
         with path.open("rb") as file:

@@ -70,7 +70,7 @@ _NAMES = ("x", "y", "z", "sdf")
 
 
 def point_cloud(points: FloatArray, time: int) -> bytes:
-    """Points (N, 3), or (N, 4) with their signed distance, in the world; exact."""
+    """Return points (N, 3), or (N, 4) with their signed distance, in the world; exact."""
     columns = points.shape[1]
     cloud = PointCloud(
         timestamp=stamp(time),
@@ -84,7 +84,7 @@ def point_cloud(points: FloatArray, time: int) -> bytes:
 
 
 def cloud_points(data: bytes, columns: int) -> FloatArray:
-    """The points (N, columns) that `point_cloud` wrote; RecordingError for any other cloud."""
+    """Return the points (N, columns) of `point_cloud`; raise RecordingError for any other cloud."""
     message = parsed(PointCloud, data)
     stride = 8 * columns
     if message.point_stride != stride or list(message.fields) != _fields(columns):
@@ -98,7 +98,7 @@ def cloud_points(data: bytes, columns: int) -> FloatArray:
 
 
 def log_line(level: str, text: str, time: int) -> bytes:
-    """A line of text of level "info" or "warning"."""
+    """Return a line of text of level "info" or "warning"."""
     if level not in _LEVELS:
         raise RecordingError(f"log level is {level!r}; accepted: {', '.join(_LEVELS)}")
     check_text("a log line", text)
@@ -106,7 +106,7 @@ def log_line(level: str, text: str, time: int) -> bytes:
 
 
 def log_level_and_text(data: bytes) -> tuple[str, str]:
-    """What `log_line` wrote."""
+    """Return the level and the text that `log_line` wrote."""
     message = parsed(Log, data)
     for name, level in _LEVELS.items():
         if message.level == level:
@@ -123,12 +123,12 @@ def _fields(columns: int) -> list[PackedElementField]:
 
 
 def stamp(time: int) -> Timestamp:
-    """A log time, nanoseconds."""
+    """Return a log time, nanoseconds."""
     seconds, nanos = divmod(time, 10**9)
     return Timestamp(seconds=seconds, nanos=nanos)
 
 
 def serialized(message: Message) -> bytes:
-    """The bytes of a message, the same each time."""
+    """Return the bytes of a message, the same each time."""
     data: bytes = message.SerializeToString(deterministic=True)
     return data

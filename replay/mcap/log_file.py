@@ -36,7 +36,7 @@ OTHER_LOGS = {
     b"\x28\xb5\x2f\xfd": ("compressed by zstd", "unpack it with `zstd -d FILE`"),
     b"SQLite f": ("a rosbag2 file in sqlite3", "convert its folder with `ros2 bag convert`"),
 }
-"""What logs of other kinds begin with, what they are, and what to do."""
+"""First bytes of logs of other kinds, with their name and what to do."""
 _END_OF_TIME = 2**63
 _ROS_TEXTS = ("ros2msg", "ros1msg")
 
@@ -63,18 +63,14 @@ class RawMessage:
 
 
 class RawFile:
-    """Reads one file, as often as wanted. Raises SessionError if it is not MCAP.
-
-    is_indexed: whether messages come in order of log time, else in the file's. channels: by id, and
-    counts: of messages by channel, both empty without an index. times: first and last log time.
-    """
+    """One file, which can be read several times. Raises SessionError if it is not MCAP."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.remarks: list[str] = []  # how it is read
-        self.channels: dict[int, Channel] = {}
-        self.counts: dict[int, int] = {}
-        self.times: tuple[int, int] | None = None
+        self.channels: dict[int, Channel] = {}  # by id, empty without an index
+        self.counts: dict[int, int] = {}  # messages by channel, empty without an index
+        self.times: tuple[int, int] | None = None  # first and last log time, nanoseconds
         self._schemas: dict[int, records.Schema] = {}
         self._chunks: list[ChunkIndex] = []
         refuse_special_file(f"log {path}", path, SessionError)
@@ -89,6 +85,7 @@ class RawFile:
                 if start != MCAP0_MAGIC:
                     raise SessionError(f"log {path} is not an MCAP file; {ACCEPTED}")
                 self.size = file.seek(0, 2)
+                # Whether messages come in order of log time, else in that of the file.
                 self.is_indexed = self._read_index(file)
         except OSError as error:
             raise SessionError(f"log {path} cannot be read: {error.strerror or error}") from None
@@ -101,7 +98,7 @@ class RawFile:
         fault: Fault,
         progress: Callable[[int], None] = lambda done: None,
     ) -> Iterator[RawMessage]:
-        """The messages on topics (None: all). fault: called with each damage. progress: with bytes.
+        """Yield the messages on topics (None: all). fault and progress: called with damage, bytes.
 
         Without an index, nothing is read behind the first damage.
         """
@@ -129,7 +126,7 @@ class RawFile:
         fault: Fault,
         progress: Callable[[int], None],
     ) -> Iterator[RawMessage]:
-        """A chunk is read once no message before it can be missing."""
+        """Yield messages by time: a chunk is read once no message before it can be missing."""
         waiting: list[tuple[int, int, int, RawMessage]] = []
         done = 0
         for chunk in self._chunks:
@@ -204,5 +201,5 @@ class RawFile:
 
 
 def _is_wanted(channel: Channel | None, topics: frozenset[str] | None) -> bool:
-    """Whether a channel is on one of the topics, or may be; None: every topic is wanted."""
+    """Return whether a channel is on one of the topics, or may be; None: every topic is wanted."""
     return topics is None or channel is None or channel.topic in topics

@@ -38,15 +38,7 @@ Placed = TypeVar("Placed", RecordedProblem, RecordedDecision)
 
 
 class Recording:
-    """What a session left behind.
-
-    path: of the file. damage: what cut reading short, None if the file is whole. start: how the
-    session began. ended: how it ended, None if it did not. probes: in their order. steps: those
-    with a registration problem. rig: of a recorded robot session, else None. image_steps: those
-    with images of sensors. offered: the first actions of a steered session, else None.
-    decision_steps: those that a decision follows, -1 for that before the first probe. attachments:
-    bytes of each, by name.
-    """
+    """A session, as its recording has it."""
 
     def __init__(
         self, path: Path, entries: list[Entry], damage: str | None, attachments: Mapping[str, int]
@@ -55,22 +47,26 @@ class Recording:
             why = "" if damage is None else f": it is {damage}"
             raise RecordingError(f"recording {path} has no session in it{why}")
         self.path = path
-        self.damage = damage
-        self.attachments = attachments
+        self.damage = damage  # what cut reading short, None if the file is whole
+        self.attachments = attachments  # bytes of each, by name
         self.start = entries[0]
+        # None if the session did not end.
         self.ended = next((entry for entry in entries if isinstance(entry, SessionEnded)), None)
-        self.probes = [entry for entry in entries if isinstance(entry, Probe)]
+        self.probes = [entry for entry in entries if isinstance(entry, Probe)]  # in their order
+        # Those with a registration problem.
         self.steps = tuple(entry.step for entry in entries if isinstance(entry, RecordedProblem))
+        # None unless a robot's log was read.
         self.rig = next((entry for entry in entries if isinstance(entry, RigDescribed)), None)
         seen = (entry.step for entry in entries if isinstance(entry, ImagePlace))
-        self.image_steps = tuple(dict.fromkeys(seen))
+        self.image_steps = tuple(dict.fromkeys(seen))  # those with images of sensors
+        # The first actions of a steered session, else None.
         self.offered = next((entry for entry in entries if isinstance(entry, ActionsOffered)), None)
         decisions = (entry.step for entry in entries if isinstance(entry, RecordedDecision))
-        self.decision_steps = tuple(decisions)
+        self.decision_steps = tuple(decisions)  # those before a decision, -1 before the first probe
         self._entries = entries
 
     def events(self, *, images: bool = True) -> Iterator[Event]:
-        """All events in the order in which they were recorded.
+        """Yield all events in the order in which they were recorded.
 
         Images are read from the file once more, one at a time, or left out.
         """
@@ -91,25 +87,25 @@ class Recording:
                 yield self._next(seen, entry)
 
     def start_at(self, step: int) -> SessionStarted:
-        """The start of the session with the true pose after a step, which pushes may change."""
+        """Return the session as it starts, with the true pose after a step."""
         before = [p.world_from_object for p in self.probes if p.step <= step]
         moved = [pose for pose in before if pose is not None]
         return replace(self.start, world_from_object=moved[-1]) if moved else self.start
 
     def sensor_images(self, steps: Sequence[int] | None = None) -> Iterator[SensorImage]:
-        """The images of some steps (None: of all) in their order, read one at a time."""
+        """Yield the images of some steps (None: of all) in their order, read one at a time."""
         for step in steps or ():
             self._check_step(step, self.image_steps, "image of a sensor")
         return self._images(steps)
 
     def problem(self, step: int) -> RegistrationProblem:
-        """The registration problem of a step, from the file alone; its digest is checked."""
+        """Return the registration problem of a step, from the file alone; its digest is checked."""
         self._check_step(step, self.steps, "registration problem")
         entry, points = self._found(RecordedProblem, step)
         return self._completed(entry, points)
 
     def decision(self, step: int) -> Decided:
-        """The decision that follows a step, with its problem, whose digest is checked."""
+        """Return the decision that follows a step, with its problem, whose digest is checked."""
         self._check_step(step, self.decision_steps, "decision")
         entry, points = self._found(RecordedDecision, step)
         before = self._entries[: self._entries.index(entry)]
@@ -117,7 +113,7 @@ class Recording:
         return self._decided(entry, offered[-1], points)
 
     def checked_steps(self, steps: Sequence[int] | None) -> tuple[int, ...]:
-        """Steps with a registration problem, in order; None means all. RecordingError if not."""
+        """Return steps with a problem, in order; None: all. Raise RecordingError for others."""
         if steps is None:
             return self.steps
         wanted, known = set(steps), set(self.steps)
@@ -126,18 +122,18 @@ class Recording:
         return tuple(step for step in self.steps if step in wanted)
 
     def hypotheses(self, step: int) -> Hypotheses:
-        """What the registration of a step found."""
+        """Return the hypotheses of the registration of a step."""
         if step not in self._results:
             self._check_step(step, tuple(self._results), "result")
         return self._results[step]
 
     def has_result(self, step: int) -> bool:
-        """Whether the registration of a step ended with hypotheses."""
+        """Return whether the registration of a step ended with hypotheses."""
         return step in self._results
 
     @property
     def seed(self) -> int:
-        """Of the random streams of its registrations; without any that of the session."""
+        """Seed of the random streams of registrations; without any that of the session."""
         seeds = (entry.seed for entry in self._entries if isinstance(entry, RecordedProblem))
         return next(seeds, self.start.seed)
 
@@ -147,7 +143,7 @@ class Recording:
         return file_digest(self.path)
 
     def snapshots(self, step: int) -> list[ArchiveSnapshot]:
-        """The archive over the registration of a step; empty if the method keeps none."""
+        """Return the archive over the registration of a step; empty if the method keeps none."""
         return list(self._snapshots.get(step, []))
 
     @cached_property
@@ -165,7 +161,7 @@ class Recording:
         return taken
 
     def _images(self, steps: Sequence[int] | None = None) -> Iterator[SensorImage]:
-        """The images in the file; others are passed by."""
+        """Yield the images in the file; other messages are passed by."""
         topic = "/sensor_image"
         schemas = {topic: TOPIC_SCHEMAS[topic]}
         file = McapFile(self.path, schemas, partial=self.damage is not None)
@@ -176,14 +172,14 @@ class Recording:
                 yield found
 
     def _next(self, seen: Iterator[SensorImage], place: ImagePlace) -> SensorImage:
-        """The image that stands at a place; the file should still be the one that was read."""
+        """Return the image at a place; raise RecordingError if the file has changed."""
         found = next(seen, None)
         if found is None or found.step != place.step:
             raise RecordingError(f"recording {self.path} has changed while it was read")
         return found
 
     def _found(self, kind: type[Placed], step: int) -> tuple[Placed, KnownPoints]:
-        """An entry of a step that is there, and all points before it."""
+        """Return an entry of a step that is there, and all points before it."""
         points = self.start.initial_points
         for entry in self._entries:
             if isinstance(entry, Probe):
@@ -216,7 +212,7 @@ def read_recording(path: str | Path, *, partial: bool = False) -> Recording:
     """Read a recording, every checksum and digest checked.
 
     With `partial`, an unfinished or damaged file gives all events before the first damage, which
-    `Recording.damage` names. Raises RecordingError if the file does not exist, is no recording of
+    `Recording.damage` names. Raise RecordingError if the file does not exist, is no recording of
     this project, is of another format, or is unfinished or damaged.
     """
     path = Path(path).expanduser()

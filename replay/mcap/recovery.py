@@ -1,4 +1,4 @@
-"""What is whole in a damaged or unfinished recording, as a finished one."""
+"""The whole parts of a damaged or unfinished recording, as a finished one."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ _WRONG = (ChselError, ValueError, RecursionError)  # what reading a message may 
 
 @dataclass
 class Recovered:
-    """What a recovery kept and what is lost."""
+    """The parts of a recording that a recovery kept, and those that are lost."""
 
     damage: str | None = None  # why the file cannot be read as it is; None if it can
     probes: list[int] = field(default_factory=list)  # steps of those kept
@@ -81,7 +81,7 @@ def recover(path: Path, out: Path) -> Recovered:
     That is everything up to the first damage, and in a finished file also each later chunk that its
     index names and whose checksum is right. Of what follows lost messages, only what does not need
     them is kept. A damaged SDF grid is made again from the mesh; if that does not give its digest,
-    the registrations and decisions on it are lost, and all else is kept. Raises RecordingError if
+    the registrations and decisions on it are lost, and all else is kept. Raise RecordingError if
     the rest of the session's start is not whole, without which nothing makes sense; if `path` is
     not a recording; or if `out` exists or cannot be written.
     """
@@ -100,7 +100,7 @@ def recover(path: Path, out: Path) -> Recovered:
 
 
 def tells_loss(event: Event) -> bool:
-    """Whether an event stands where a recovery could not keep what had been recorded."""
+    """Return whether an event stands where a recovery could not keep what had been recorded."""
     return (
         isinstance(event, Logged) and event.level == "warning" and event.text.startswith(RECOVERED)
     )
@@ -121,7 +121,7 @@ class _Recovery:
         self._another_grid = ""  # why the grid is not that of the session; "" if it is
 
     def events(self) -> Iterator[Event]:
-        """Each event as it was; where some are lost, a warning; an end where there is none."""
+        """Yield each event, a warning where some are lost, and an end where there is none."""
         for part in self._parts():
             if isinstance(part, StoredMessage):
                 yield from self._taken(part)
@@ -136,7 +136,7 @@ class _Recovery:
             yield SessionEnded(self._order.step, f"{RECOVERED}how the session ended is not known")
 
     def _parts(self) -> Iterator[StoredMessage | tuple[str, str]]:
-        """All whole messages in the order of writing, and what is lost between them, and why."""
+        """Yield all whole messages in the order of writing, and what is lost where, and why."""
         file = self._file
         yield from file.messages()
         self.found.damage = file.damage
@@ -163,7 +163,7 @@ class _Recovery:
                 yield from messages
 
     def _taken(self, message: StoredMessage) -> Iterator[Event]:
-        """The event that a message completes, if it still makes sense where it is."""
+        """Yield the event that a message completes, if it still makes sense where it is."""
         topic, step = message.topic, message.log_time // STEP_TIME - 1
         if topic == "/session":
             message = self._with_grid(message)
@@ -186,7 +186,7 @@ class _Recovery:
                 yield from self._lost("the SDF grid", self._another_grid)
 
     def _completed(self, entry: Entry, message: StoredMessage) -> Event:
-        """With its whole problem; RecordingError if something of lost messages is missing."""
+        """Return it with its whole problem; raise RecordingError if a part of that is lost."""
         if isinstance(entry, ImagePlace):
             return image_from(decode(RECORDS[entry.topic], message.data))
         if not isinstance(entry, RecordedProblem | RecordedDecision):
@@ -218,14 +218,14 @@ class _Recovery:
                 self.found.ended = True
 
     def _lost(self, what: str, reason: str) -> Iterator[Event]:
-        """A line in the recording where something is lost; behind the end there can be none."""
+        """Yield a line of the log where something is lost; nothing behind the end."""
         if what not in self.found.lost:
             self.found.lost[what] = reason
             if self._start is not None and not self.found.ended:
                 yield Logged(self._order.step, "warning", f"{RECOVERED}lost: {what}: {reason}")
 
     def _with_grid(self, message: StoredMessage) -> StoredMessage:
-        """The session's message; a damaged SDF grid is made again as far as that can be.
+        """Return the session's message; a damaged SDF grid is made again as far as that can be.
 
         If no grid of the mesh has the digest, one stands in, and the message names it: the session
         can then be read, and what depends on the grid shows by its digest that it is another.
@@ -262,7 +262,7 @@ class _Recovery:
 def _grids(
     mesh: trimesh.Trimesh, config: str, attachments: Mapping[str, bytes]
 ) -> Iterator[SdfGrid]:
-    """Grids that the session may have had: as configured, by default, as the damaged one begins."""
+    """Yield grids that the session may have had: configured, default, as the damaged one begins."""
     ways: list[tuple[float | None, float]] = [(None, OBJECT_PADDING)]
     with suppress(*_WRONG, LookupError, TypeError):
         session = config_from_json(config)["session"]

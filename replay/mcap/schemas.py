@@ -39,7 +39,7 @@ FORMAT_VERSION = 1
 """A reader refuses every other one, so any change of meaning needs a new number."""
 
 PROFILE = "chsel"
-"""How the file's header names this use of MCAP."""
+"""Name of this use of MCAP in the header of a file."""
 
 STEP_TIME = 10**9
 """Nanoseconds of log time from one step to the next; step k begins at k + 1 times this."""
@@ -253,4 +253,4 @@ TOGETHER: Mapping[str, Callable[[Mapping[str, Any]], None]] = {
     "Hypotheses": check_hypotheses,
     "Rig": check_hand,
 }
-"""What the values of a message must be together; raises RecordingError."""
+"""Checks of the values of a message together; they raise RecordingError."""

@@ -1,4 +1,4 @@
-"""Texts of a recording: what a terminal or a viewer can show without being told what to do."""
+"""Texts of a recording: what a terminal or a viewer shows as it is, without control characters."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def check_text(what: str, text: str, longest: int = LONGEST) -> None:
 
 
 def one_line(text: str) -> str:
-    """What an error can quote of a file: on one line, of bounded length, without controls."""
+    """Return a text as errors quote it: one line, of bounded length, without controls."""
     line = _CONTROL.sub(lambda found: repr(found[0])[1:-1], " ".join(text.split()))
     return line if len(line) <= LONGEST_NAME else f"{line[:LONGEST_NAME]}..."
 
 
 def check_name(what: str, text: str) -> None:
-    """The same for a short name on one line."""
+    """Raise RecordingError unless a text is a short name on one line."""
     check_text(what, text, LONGEST_NAME)
     if "\n" in text:
         raise RecordingError(f"{what} is {text!r}; accepted: a name on one line")

@@ -1,7 +1,8 @@
-"""What the table of messages accepts, and in which order the events of a session can come.
+"""Checks of the values of messages, and of the order of the events of a session.
 
-The writer lets nothing else into a recording, and the reader nothing else out: a recording can come
-from anybody.
+The writer lets nothing else into a recording, and the reader nothing else out: a file of another
+program, or a damaged one, is an error and not a wrong result. Files made to exhaust time or memory
+are not defended against, but for the limit of `file.py` on what a chunk may unpack to.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _BEFORE_ALL_STEPS = -1
 
 
 def one_of(*accepted: str) -> Check:
-    """One of some texts."""
+    """Return the check of a text that is one of `accepted`."""
 
     def check(field: str, value: str) -> None:
         if value not in accepted:
@@ -38,7 +39,7 @@ def one_of(*accepted: str) -> Check:
 
 
 def between(low: float, high: float, unit: str) -> Check:
-    """A number from `low` to `high`, in a unit."""
+    """Return the check of a number from `low` to `high`, in a unit."""
 
     def check(field: str, value: float) -> None:
         if not low <= value <= high:
@@ -48,19 +49,19 @@ def between(low: float, high: float, unit: str) -> Check:
 
 
 def short_names(field: str, value: tuple[str, ...] | Mapping[str, Any]) -> None:
-    """Such texts, or a mapping with such names."""
+    """Accept short names, or a mapping with such names."""
     for item in value:
         check_name(f"a name of {field}", item)
 
 
 def plain_texts(field: str, value: Mapping[str, str]) -> None:
-    """Texts without control characters, by their names."""
+    """Accept texts without control characters, by their names."""
     for key, text in value.items():
         check_text(f"{key} of {field}", text)
 
 
 def session_end(field: str, value: str) -> None:
-    """How a session ends."""
+    """Accept the outcome of a session."""
     check_text(field, value)
     if value not in _ENDS and not value.startswith((_FAILED, RECOVERED)):
         accepted = f"{', '.join(_ENDS)}, {_FAILED}REASON, {RECOVERED}REASON"
@@ -68,61 +69,61 @@ def session_end(field: str, value: str) -> None:
 
 
 def stop_reason(field: str, value: str) -> None:
-    """Why a decision makes no further probe, "" if it makes one."""
+    """Accept why a decision makes no further probe, "" if it makes one."""
     from chsel.next_probe.decision_problem import STOPS
 
     one_of(*STOPS)(field, value)
 
 
 def verdict(field: str, value: str) -> None:
-    """On the result that a decision follows, "" if there is none."""
+    """Accept a verdict on the result before a decision, "" without one."""
     from chsel.problem.registration_problem import VERDICTS
 
     one_of("", *VERDICTS)(field, value)
 
 
 def sensor_name(field: str, value: str) -> None:
-    """A word, as it is a part of names of files and topics."""
+    """Accept a word, as names of files and topics contain it."""
     check_name(field, value)
     if not value.replace("_", "").isalnum():
         raise RecordingError(f"{field} is {value!r}; accepted: letters, digits and _")
 
 
 def finite(field: str, value: Any) -> None:
-    """Finite numbers: an array, a number, or a mapping to numbers."""
+    """Accept finite numbers: an array, a number, or a mapping to numbers."""
     numbers = list(value.values()) if isinstance(value, Mapping) else value
     if not np.isfinite(numbers).all():
         raise RecordingError(f"{field} has a number that is not finite; accepted: finite numbers")
 
 
 def positive(field: str, value: np.ndarray) -> None:
-    """Finite numbers above 0."""
+    """Accept finite numbers above 0."""
     finite(field, value)
     if not (value > 0.0).all():
         raise RecordingError(f"{field} has {value.min():g}; accepted: above 0")
 
 
 def chances(field: str, value: np.ndarray) -> None:
-    """Numbers from 0 to 1, but for rounding."""
+    """Accept numbers from 0 to 1, but for rounding."""
     if not ((value >= 0.0) & (value <= 1.0 + _ROUNDING)).all():
         raise RecordingError(f"{field} has a number that is no chance; accepted: 0 to 1")
 
 
 def distribution(field: str, value: np.ndarray) -> None:
-    """Weights (K,), of sum 1 but for rounding."""
+    """Accept weights (K,), of sum 1 but for rounding."""
     chances(field, value)
     if abs(float(value.sum()) - 1.0) > _ROUNDING:
         raise RecordingError(f"{field} have the sum {value.sum():g}; accepted: 1")
 
 
 def not_empty(field: str, value: np.ndarray) -> None:
-    """An array of at least one row."""
+    """Accept an array of at least one row."""
     if len(value) == 0:
         raise RecordingError(f"{field} is empty; accepted: at least one")
 
 
 def rigid(field: str, value: np.ndarray) -> None:
-    """Rigid transforms (B, 4, 4), or one (4, 4)."""
+    """Accept rigid transforms (B, 4, 4), or one (4, 4)."""
     from chsel.problem.poses import check_rigid
 
     with np.errstate(all="ignore"):
@@ -133,14 +134,14 @@ def rigid(field: str, value: np.ndarray) -> None:
 
 
 def voxel_side(field: str, value: float) -> None:
-    """A side of voxels that a problem can have, metres."""
+    """Accept a side of voxels that a problem can have, metres."""
     from chsel.problem.sdf_grid import COARSEST, FINEST
 
     between(FINEST, COARSEST, "m")(field, value)
 
 
 def intrinsics(field: str, value: np.ndarray) -> None:
-    """Focal lengths and centre (4,) of a camera, pixels."""
+    """Accept focal lengths and centre (4,) of a camera, pixels."""
     from chsel.sensing.depth_camera import MOST_FOCUS
 
     if not (np.abs(value) <= MOST_FOCUS).all() or not (value[:2] > 0.0).all():
@@ -151,7 +152,7 @@ def intrinsics(field: str, value: np.ndarray) -> None:
 
 
 def ascending_costs(field: str, value: np.ndarray) -> None:
-    """Costs (B,) in ascending order; the last ones may be inf."""
+    """Accept costs (B,) in ascending order; the last ones may be inf."""
     if np.isnan(value).any() or not (value[:-1] <= value[1:]).all():
         raise RecordingError(f"{field} is out of order; accepted: ascending numbers")
     if np.isneginf(value).any():
@@ -252,16 +253,12 @@ def check_digest(what: str, digest: str, recorded: str) -> None:
 
 
 class EventOrder:
-    """Follows the events of one session: steps ascend, and a step has one problem, one result.
-
-    step: of the last event, -1 before all steps. has_rig: whether a rig was described.
-    has_actions: whether actions were offered.
-    """
+    """The order of the events of one session: steps ascend, with one problem and result each."""
 
     def __init__(self) -> None:
-        self.step = _BEFORE_ALL_STEPS
-        self.has_rig = False
-        self.has_actions = False
+        self.step = _BEFORE_ALL_STEPS  # of the last event
+        self.has_rig = False  # a rig was described
+        self.has_actions = False  # actions were offered
         self._probe = _BEFORE_ALL_STEPS  # the step of the last probe
         self._posed = _BEFORE_ALL_STEPS  # the step of the last problem
         self._registering = False  # a problem is posed and has no result yet

@@ -1,4 +1,4 @@
-"""What a viewer draws of a session without our help: the object, the hypotheses, all points.
+"""Messages that other viewers draw: the object, the hypotheses, all points.
 
 Foxglove draws the meshes. Rerun passes them by and draws the clouds. All of it repeats what other
 messages say, rounded.
@@ -72,14 +72,14 @@ View = tuple[str, Callable[[int], bytes]]
 
 
 class Views:
-    """Makes the messages for viewers that follow those of an event."""
+    """The messages for viewers that follow those of an event."""
 
     def __init__(self) -> None:
         self._points = {name: CumulativePoints() for name in POINT_CLASSES}
         self._scene: SceneMessages | None = None
 
     def after(self, event: Event) -> Iterator[View]:
-        """Messages in their order; each is made when it is written."""
+        """Yield messages in their order; each is made when it is written."""
         match event:
             case SessionStarted():
                 self._scene = SceneMessages(event.mesh)
@@ -107,7 +107,7 @@ class Views:
                 yield "/modes", partial(modes, event)
 
     def _all_points(self, new: KnownPoints) -> Iterator[View]:
-        """The clouds of all points so far that change with new ones."""
+        """Yield the clouds of all points so far that change with new ones."""
         for name, cumulative in self._points.items():
             points = getattr(new, name)
             for level, cloud in cumulative.add(points).items() if len(points) else ():
@@ -116,7 +116,7 @@ class Views:
 
 
 class SceneMessages:
-    """Makes the messages of one object."""
+    """The messages of one object."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self._vertices, faces = simple_mesh(mesh)
@@ -126,23 +126,23 @@ class SceneMessages:
         self._mesh = TriangleListPrimitive(points=points, indices=faces.ravel().tolist())
 
     def object_mesh(self, time: int) -> bytes:
-        """The object where the frame "object" is."""
+        """Return the object where the frame "object" is."""
         color = (*OBJECT_COLOR, _OBJECT_OPACITY)
         return self._scene("object", _OBJECT, np.eye(4)[None], [color], time)
 
     def object_surface(self, time: int) -> bytes:
-        """Vertices of the object where the frame "object" is."""
+        """Return vertices of the object where the frame "object" is."""
         color = np.array(OBJECT_COLOR, np.uint8)
         return colored_cloud(self._vertices, color, time, frame=_OBJECT)
 
     def hypothesis_meshes(self, poses: FloatArray, colors: ColorArray, time: int) -> bytes:
-        """The object at each hypothesis (D, 4, 4), in its color (D, 3), the best one bright."""
+        """Return the object at each hypothesis (D, 4, 4), in its color (D, 3), the best bright."""
         opacities = [_BEST_OPACITY, *[_OTHER_OPACITY] * len(poses)]
         shown = [(*color, a) for color, a in zip(colors.tolist(), opacities, strict=False)]
         return self._scene("hypotheses", WORLD, poses, shown, time)
 
     def hypothesis_surfaces(self, poses: FloatArray, colors: ColorArray, time: int) -> bytes:
-        """The same as points of the surface."""
+        """Return points of the surface of the object at each hypothesis."""
         points = self._surface @ poses[:, :3, :3].swapaxes(-1, -2) + poses[:, None, :3, 3]
         return colored_cloud(
             points.reshape(-1, 3), np.repeat(colors, len(self._surface), axis=0), time
@@ -156,7 +156,7 @@ class SceneMessages:
         colors: list[tuple[float, ...]],
         time: int,
     ) -> bytes:
-        """The object at poses (B, 4, 4), each in a color: red, green, blue to 255, opacity to 1."""
+        """Return the object at poses (B, 4, 4), each in a color: RGB to 255, opacity to 1."""
         entity = SceneEntity(timestamp=stamp(time), id=name, frame_id=frame, frame_locked=True)
         for pose, (r, g, b, a) in zip(_poses(poses), colors, strict=True):
             triangles = entity.triangles.add(
@@ -167,11 +167,11 @@ class SceneMessages:
 
 
 class CumulativePoints:
-    """Spreads points over levels: the newest at level 0, each further level 8 times as large.
+    """Points spread over levels: the newest at level 0, each further level 8 times as large.
 
-    The levels together hold all points. A level is written anew when it changes, so that a point
+    The levels together hold all points. A level is written when it changes, so that a point
     is written about 4 times at each level it passes, however long the session. Writing all points
-    anew at every step would take quadratic space.
+    at every step would take quadratic space.
     """
 
     def __init__(self) -> None:
@@ -193,13 +193,13 @@ class CumulativePoints:
 
 
 def poses_in_world(world_from_body: FloatArray, time: int) -> bytes:
-    """Poses (B, 4, 4) as positions and quaternions."""
+    """Return poses (B, 4, 4) as positions and quaternions."""
     poses = _poses(world_from_body)
     return serialized(PosesInFrame(timestamp=stamp(time), frame_id=WORLD, poses=poses))
 
 
 def next_probe(event: Decided, time: int) -> bytes:
-    """The chosen action as an arrow from the start of the hand to its end; nothing after a stop."""
+    """Return the chosen action as an arrow along the hand's way; nothing after a stop."""
     entity = SceneEntity(timestamp=stamp(time), id="next probe", frame_id=WORLD)
     chosen, actions = event.decision.chosen, event.problem.actions
     if chosen >= 0:
@@ -221,7 +221,7 @@ def next_probe(event: Decided, time: int) -> bytes:
 
 
 def modes(event: Believed, time: int) -> bytes:
-    """The ellipsoid of each mode, in a color by its number; nothing for a belief without modes."""
+    """Return the ellipsoid of each mode, in a color by its number; nothing without modes."""
     entity = SceneEntity(timestamp=stamp(time), id="modes", frame_id=WORLD)
     places, half_sizes = ellipsoids(event)
     for pose, size, number in zip(_poses(places), 2.0 * half_sizes, event.numbers, strict=True):
@@ -232,7 +232,7 @@ def modes(event: Believed, time: int) -> bytes:
 
 
 def ellipsoids(event: Believed) -> tuple[FloatArray, FloatArray]:
-    """Ellipsoids of two standard deviations around the object's centre in each mode.
+    """Return ellipsoids of two standard deviations around the object's centre in each mode.
 
     Poses world_from_ellipsoid (M, 4, 4), along whose axes the half sizes (M, 3) are, metres.
     """
@@ -243,7 +243,7 @@ def ellipsoids(event: Believed) -> tuple[FloatArray, FloatArray]:
 
 
 def object_in_world(world_from_object: FloatArray, time: int) -> bytes:
-    """The pose (4, 4) of the object as a transform between frames."""
+    """Return the pose (4, 4) of the object as a transform between frames."""
     (pose,) = _poses(world_from_object[None])
     transform = FrameTransform(
         timestamp=stamp(time),
@@ -256,7 +256,7 @@ def object_in_world(world_from_object: FloatArray, time: int) -> bytes:
 
 
 def colored_cloud(points: FloatArray, color: ColorArray, time: int, frame: str = WORLD) -> bytes:
-    """Points (N, 3), rounded to float32, in one color (3,) or a color each (N, 3)."""
+    """Return points (N, 3), rounded to float32, in one color (3,) or a color each (N, 3)."""
     data = np.zeros(len(points), _POINT)
     with np.errstate(over="ignore"):
         data["position"] = points
@@ -277,12 +277,12 @@ def colored_cloud(points: FloatArray, color: ColorArray, time: int, frame: str =
 
 
 def empty_cloud(time: int) -> bytes:
-    """A cloud of no points."""
+    """Return a cloud of no points."""
     return colored_cloud(np.zeros((0, 3)), np.zeros(3, np.uint8), time)
 
 
 def _poses(poses: FloatArray) -> list[Pose]:
-    """Poses (B, 4, 4) as positions and quaternions."""
+    """Return poses (B, 4, 4) as positions and quaternions."""
     turned = quaternions(poses[:, :3, :3]).tolist()
     return [
         Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
@@ -291,14 +291,14 @@ def _poses(poses: FloatArray) -> list[Pose]:
 
 
 def _shown(found: Hypotheses) -> tuple[FloatArray, ColorArray]:
-    """world_from_object (D, 4, 4) of distinct hypotheses, best first, and colors (D, 3) by rank."""
+    """Return world_from_object (D, 4, 4) of distinct hypotheses and colors (D, 3), best first."""
     kept = ~found.duplicate & np.isfinite(found.object_from_world).all(axis=(1, 2))
     poses = inverse(found.object_from_world[kept])
     return poses, cost_colors(np.arange(len(poses)) / max(1, len(poses) - 1))
 
 
 def simple_mesh(mesh: trimesh.Trimesh, most: int = _MOST_FACES) -> tuple[FloatArray, IntArray]:
-    """Vertices (V, 3) and at most `most` faces (F, 3) that look like a mesh, in its frame.
+    """Return vertices (V, 3) and at most `most` faces (F, 3) that look like a mesh, in its frame.
 
     Vertices are joined cell by cell of a grid that becomes coarser until the faces are few enough.
     """
@@ -312,7 +312,7 @@ def simple_mesh(mesh: trimesh.Trimesh, most: int = _MOST_FACES) -> tuple[FloatAr
 
 
 def _joined(vertices: FloatArray, faces: IntArray, cells: int) -> tuple[FloatArray, IntArray]:
-    """The vertices of each cell as one, their mean; without the faces that vanish."""
+    """Return the vertices of each cell as one, their mean; without the faces that vanish."""
     lower, upper = vertices.min(axis=0), vertices.max(axis=0)
     side = max(float((upper - lower).max()) / cells, np.finfo(np.float64).tiny)
     place = np.minimum(np.floor((vertices - lower) / side), cells - 1).astype(np.int64)

@@ -50,7 +50,7 @@ _LIBRARY = "chsel-replay"  # without versions of packages, which stand in the se
 
 
 class McapRecorder(Recorder):
-    """Writes one recording to a new file.
+    """A recorder of one session to a new MCAP file.
 
     Log time counts messages, in nanoseconds, from one second per step: step k lies between k + 1 s
     and k + 2 s. No wall-clock time enters the file, but for `Timed` events if there are any.
@@ -167,7 +167,7 @@ class McapRecorder(Recorder):
         self._write_points(event.step, event.initial_points)
 
     def _write_points(self, step: int, new: KnownPoints) -> None:
-        """New points, class by class, and then how many are known with them."""
+        """Write new points, class by class, and then how many are known with them."""
         assert self._points is not None
         known = np.column_stack([new.known, new.sdf])
         for topic, points in zip(CLOUDS, (new.free, new.occupied, known), strict=True):
@@ -209,7 +209,7 @@ class McapRecorder(Recorder):
         self._record(event.topic, event.step, event_values(event))
 
     def _is_given(self, problem: RegistrationProblem | DecisionProblem) -> bool:
-        """Whether points and grid of a problem are those of the events before."""
+        """Return whether points and grid of a problem are those of the events before."""
         assert self._points is not None
         assert self._start is not None
         given = self._points.digest, self._start.sdf.digest
@@ -226,7 +226,7 @@ class McapRecorder(Recorder):
         self._last_elites = found.elites
 
     def _hypotheses_values(self, event: HypothesesFound) -> dict[str, Any]:
-        """The message `Hypotheses` with its archive."""
+        """Return the message `Hypotheses` with its archive."""
         found = event.hypotheses
         archive = None if found.archive is None else archive_values(event.step, found.archive)
         values = shared_values("Hypotheses", found)
@@ -294,7 +294,7 @@ class McapRecorder(Recorder):
 
 
 def _same(one: SnapshotTaken, other: SnapshotTaken) -> bool:
-    """Whether two snapshots are of the same moment, and equal to the bit."""
+    """Return whether two snapshots are of the same moment, and equal to the bit."""
     first, second = (
         (each.step, each.archive.iteration, each.archive.refinement, each.archive.digest)
         for each in (one, other)

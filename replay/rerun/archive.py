@@ -15,7 +15,7 @@ _MARK = (255, 255, 255)
 
 
 class ArchiveMap:
-    """Draws snapshots of archives under the entity `archive`; a unit of the view is one cell."""
+    """The map of an archive under the entity `archive`; a unit of the view is one cell."""
 
     def __init__(self, stream: rr.RecordingStream) -> None:
         self.size: tuple[int, int] | None = None  # width and height of the last map, in cells
@@ -24,12 +24,12 @@ class ArchiveMap:
         self._last: ArchiveSnapshot | None = None
 
     def start(self) -> None:
-        """A registration starts, with a new archive: the marks on the last one are gone."""
+        """Start the archive of a registration, without the marks on the last one."""
         self._scale = self._last = None
         self._mark(np.zeros((0, 2)), [])
 
     def draw(self, step: int, archive: ArchiveSnapshot) -> None:
-        """The lowest cost in each cell, empty cells in grey; a caption and the ranges of axes."""
+        """Draw the lowest cost in each cell, empty cells in grey, a caption and ranges of axes."""
         scale = CostScale.of(-archive.objectives)
         if self._scale is not None:
             ends = (scale.low, scale.high, self._scale.low, self._scale.high)
@@ -74,7 +74,7 @@ class ArchiveMap:
 
 
 def lowest_costs(archive: ArchiveSnapshot) -> np.ndarray:
-    """The map (height, width) as float32: the lowest cost over all further measures, NaN if empty.
+    """Return the map (height, width), float32: the lowest cost over other measures, NaN if empty.
 
     The first measure runs to the right, the second upwards; one measure alone makes a strip.
     """
@@ -88,7 +88,7 @@ def lowest_costs(archive: ArchiveSnapshot) -> np.ndarray:
 
 
 def heat_map(costs: np.ndarray, scale: CostScale) -> ColorArray:
-    """The picture (height, width, 3) of costs (height, width)."""
+    """Return the picture (height, width, 3) of costs (height, width)."""
     filled = ~np.isnan(costs)
     picture = np.full((*costs.shape, 3), EMPTY_CELL, dtype=np.uint8)
     picture[filled] = cost_colors(scale.fraction(costs[filled]))
@@ -100,7 +100,7 @@ def _rows(archive: ArchiveSnapshot) -> int:
 
 
 def _places(archive: ArchiveSnapshot, cells: IntArray) -> tuple[IntArray, IntArray]:
-    """Column and row of cells, along the first two measures."""
+    """Return column and row of cells, along the first two measures."""
     indices = np.unravel_index(cells, archive.shape)
     columns = np.asarray(indices[0], dtype=np.int64)
     rows = np.asarray(indices[1], dtype=np.int64) if len(indices) > 1 else np.zeros_like(columns)
@@ -108,7 +108,7 @@ def _places(archive: ArchiveSnapshot, cells: IntArray) -> tuple[IntArray, IntArr
 
 
 def _texts(step: int, archive: ArchiveSnapshot, scale: CostScale) -> list[str]:
-    """Caption with what runs upwards, and what runs to the right."""
+    """Return the caption with the upward measure, and the label of the one to the right."""
     refinement = f", refinement {archive.refinement}" if archive.refinement else ""
     caption = (
         f"probe {step}, iteration {archive.iteration}{refinement}: {len(archive.cells)} of "

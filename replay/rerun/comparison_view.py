@@ -37,7 +37,7 @@ CURVES: Mapping[str, tuple[str, float]] = {
     "closest_rotation_error": ("Rotation error of the closest [°]", DEGREES),
     "spread": ("Spread [mm]", MILLIMETRES),
 }
-"""What is drawn over probes, a curve for each method: title of the view, and its unit."""
+"""Numbers drawn over probes, a curve for each method: title of the view, and its unit."""
 _COLUMNS = (  # of the views of curves
     ("log10_best_cost", "log10_median_cost"),
     ("best_position_error", "best_rotation_error"),
@@ -57,7 +57,7 @@ def save_comparison(
 
     results: hypotheses by the label of a method, then by step; a method may lack steps. Costs,
     and with them the order of a step's hypotheses, are those of `common_cost`.
-    Raises RecordingError if there is no result, a step has no problem, or the file cannot be
+    Raise RecordingError if there is no result, a step has no problem, or the file cannot be
     written or exists; nothing is left of it then.
     """
     steps = sorted({step for found in results.values() for step in found})
@@ -79,7 +79,7 @@ def save_comparison(
 
 
 class _Comparison:
-    """Draws one scene for all, and the results of each method at entities of its number."""
+    """One scene for all methods, and the results of each at entities of its number."""
 
     def __init__(
         self, stream: rr.RecordingStream, recording: Recording, labels: Sequence[str]
@@ -104,12 +104,12 @@ class _Comparison:
                 style_curve(stream, f"curves/{name}/{n}", label, SERIES[n % len(SERIES)])
 
     def add_probe(self, probe: Probe) -> None:
-        """What a probe adds to the scene."""
+        """Draw a probe in the scene."""
         self._stream.set_time(PROBE, sequence=probe.step)
         self._scene.add_probe(probe)
 
     def add_results(self, problem: RegistrationProblem, found: Mapping[str, Hypotheses]) -> None:
-        """The hypotheses of methods, by their labels, for one problem."""
+        """Draw the hypotheses of methods, by their labels, for one problem."""
         self._stream.set_time(PROBE, sequence=problem.key.step)
         with warnings.catch_warnings(action="ignore"):  # those that registered have been warned
             judge = CompiledCost.of(problem, self._cost.settings)
@@ -135,13 +135,13 @@ class _Comparison:
             self._summarise(n, _summary(hypotheses, scale, literal(self._cost.name), numbers))
 
     def _summarise(self, n: int, text: str) -> None:
-        """Text below the view of a method."""
+        """Write a text below the view of a method."""
         document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
         self._stream.log(f"summary/{n}", document)
 
 
 def ranked(hypotheses: Hypotheses, judge: CompiledCost) -> Hypotheses:
-    """The same hypotheses with their costs by a judge, ascending.
+    """Return hypotheses with their costs by a judge, ascending.
 
     Of poses that repeat each other, the one that was the first by its method's cost stays it.
     """
@@ -173,7 +173,7 @@ def _summary(
 
 
 def _blueprint(workspace: Workspace, labels: Sequence[str], *, pose_known: bool) -> rrb.Blueprint:
-    """A view for each method, four in a row at most, and curves below."""
+    """Return a view for each method, four in a row at most, and curves below."""
     count = len(labels)
     columns = count if count <= _IN_A_ROW else math.ceil(math.sqrt(count))
     methods = [

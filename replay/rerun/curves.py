@@ -35,13 +35,13 @@ class Curves:
         self._named: list[str] = []
 
     def add(self, entity: str, value: float, color: Rgb | None = None) -> None:
-        """A number at this moment; by default in the next colour of its view."""
+        """Add a number at this moment, by default in the next colour of its view."""
         if math.isfinite(value):
             self._style(entity, color)
             self._stream.log(entity, rr.Scalars(value))
 
     def add_hypotheses(self, hypotheses: Hypotheses) -> None:
-        """Lowest, median and highest cost of the hypotheses, and how many differ."""
+        """Add lowest, median and highest cost of the hypotheses, and how many differ."""
         cost = hypotheses.cost
         if len(cost):
             values = (cost.min(), np.median(cost), cost.max())
@@ -50,14 +50,14 @@ class Curves:
         self.add("distinct/hypotheses", float(hypotheses.distinct))
 
     def add_measured(self, name: str, value: float) -> None:
-        """One measured number; its name says where it is shown."""
+        """Add one measured number to the view that its name chooses."""
         if name != _OF_HYPOTHESES:
             part = next(part for part in _MEASURED if part in name)
             view, unit = _MEASURED[part]
             self.add(f"{view}/{name.removesuffix(f'_{part}')}", unit * value)
 
     def add_trace(self, iteration: int, traced: Traced) -> None:
-        """Costs of the search, which have no place on the timeline of probes."""
+        """Add costs of the search, which have no place on the timeline of probes."""
         for (name, color), cost in zip(COSTS.items(), traced.costs, strict=True):
             if math.isfinite(cost):
                 self._style(f"search/{name}", color)

@@ -21,7 +21,7 @@ _WIDTHS = (0.75, 0.35)  # radii of the arrows of actions that can be taken and t
 
 
 class Decisions:
-    """All that is drawn of decisions, in the scene, as curves and in the log.
+    """Drawings of decisions, in the scene, as curves and in the log.
 
     A forecast stands at the probe that it is of.
     """
@@ -73,14 +73,14 @@ class Decisions:
         self._add_curves(event)
 
     def add_probe(self, probe: Probe) -> None:
-        """Whether a probe hit, beside the chance of it; nothing of one that no decision led to."""
+        """Draw whether a probe hit, beside its forecast; nothing without a decision before it."""
         if self._hit_chance is not None:
             self._curves.add("decision/hit/forecast_chance", self._hit_chance)
             self._curves.add("decision/hit/outcome", float(len(probe.contacts) > 0))
             self._hit_chance = None
 
     def _add_curves(self, event: Decided) -> None:
-        """The spread that a decision found, and the surprise of the probe before it."""
+        """Add the spread that a decision found, and the surprise of the probe before it."""
         decision = event.decision
         self._curves.add("decision/spread/spread", MILLIMETRES * decision.spread)
         if self._expected is not None:
@@ -93,7 +93,7 @@ class Decisions:
 
 
 def _text(event: Decided) -> str:
-    """A line about a decision for the log."""
+    """Return a line about a decision for the log."""
     decision = event.decision
     spread = f"spread {number(MILLIMETRES * decision.spread)} mm"
     if decision.chosen < 0:
@@ -108,10 +108,10 @@ def _text(event: Decided) -> str:
 
 
 def _starts(actions: Actions) -> FloatArray:
-    """Where the hand starts (A, 3), world, metres."""
+    """Return the start (A, 3) of the hand in each action, world, metres."""
     return actions.world_from_hand[:, :3, 3]
 
 
 def _ways(actions: Actions) -> FloatArray:
-    """The hand's way (A, 3) unless it meets something, world, metres."""
+    """Return the hand's way (A, 3) unless it meets something, world, metres."""
     return actions.world_from_hand[:, :3, 2] * actions.length[:, None]

@@ -68,7 +68,7 @@ class RerunRecorder(Recorder):
     def flush(self) -> None:
         """Hand all events so far to the operating system, and to the viewer if there is one.
 
-        A viewer that is slow, or was closed, is a warning. Raises RecordingError if the file does
+        A viewer that is slow, or was closed, is a warning. Raise RecordingError if the file does
         not get them; nothing more is drawn then.
         """
         if self._closed:
@@ -88,7 +88,7 @@ class RerunRecorder(Recorder):
 
     @singledispatchmethod
     def _draw(self, event: events.Event) -> None:
-        """Events without a branch of their own: numbers about a step are curves."""
+        """Draw an event without a branch of its own: numbers about a step are curves."""
         if event.topic in NUMBERS:
             for name, value in step_numbers(event).items():
                 self._curves.add_measured(name, value)
@@ -206,7 +206,7 @@ class RerunRecorder(Recorder):
 def draw_recording(recording: Recording, path: Path, *, last: int | None = None) -> None:
     """Write to `path`, a new file, what the run wrote beside its MCAP file.
 
-    last: the last probe that is drawn; None: all are. Raises RecordingError if the file exists,
+    last: the last probe that is drawn; None: all are. Raise RecordingError if the file exists,
     cannot be written, or a problem of the recording is not the recorded one; nothing is left of
     the file then.
     """

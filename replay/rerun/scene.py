@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 NORMAL_LENGTH = 0.035  # in diagonals of the workspace
 CUMULATIVE = ("free", "occupied", "contacts", "contacts/normals", "known", "gripper/past")
-"""What each probe adds to: a view shows these over all probes up to the moment."""
+"""Entities to which each probe adds: a view shows these over all probes so far."""
 HIDDEN = np.zeros((1, 4, 4))
 """A pose that shows nothing: without any, the viewer draws the mesh once, at the origin."""
 LEVELS = 8
@@ -51,7 +51,7 @@ _HAND_ALPHA = 80
 
 
 class Scene:
-    """Draws everything but hypotheses and actions under the entity `scene`."""
+    """The entity `scene`: everything but hypotheses and actions."""
 
     def __init__(self, stream: rr.RecordingStream) -> None:
         self._stream = stream
@@ -61,7 +61,7 @@ class Scene:
     def set_up(
         self, mesh: trimesh.Trimesh, workspace: Workspace, world_from_object: FloatArray | None
     ) -> None:
-        """What does not change: the workspace, and the object at its true pose where known."""
+        """Draw what does not change: the workspace, and the object at its true pose where known."""
         self._stream.log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         lower, upper = workspace.bounds
         self._normal_length = NORMAL_LENGTH * float(np.linalg.norm(upper - lower))
@@ -80,19 +80,19 @@ class Scene:
         world_from_mesh: FloatArray,
         color: tuple[int, int, int, int],
     ) -> None:
-        """A mesh at one pose (4, 4) all the time."""
+        """Draw a mesh at one pose (4, 4) all the time."""
         pose = rr.Transform3D(translation=world_from_mesh[:3, 3], mat3x3=world_from_mesh[:3, :3])
         self._stream.log(f"scene/{name}", display_mesh(mesh, color), pose, static=True)
 
     def add_hand(self, hand: trimesh.Trimesh | HandShape) -> None:
-        """The hand, which probes show where they are deepest."""
+        """Draw the hand, which probes show where they are deepest."""
         drawn = display_mesh(coarsened(hand), (*HAND, _HAND_ALPHA))
         self._stream.log("scene/hand", drawn, static=True)
         self._stream.log("scene/hand", mesh_poses(HIDDEN))
         self._has_hand = True
 
     def add_points(self, points: KnownPoints) -> None:
-        """Points that become known."""
+        """Draw points that become known."""
         exact = points.sdf == 0.0
         self._points("free", points.free, FREE_FAINT, size=0.9)
         self._points("occupied", points.occupied, OCCUPIED, size=2.5)
@@ -100,7 +100,7 @@ class Scene:
         self._points("contacts", points.known[exact], CONTACT, size=5.0)
 
     def add_probe(self, probe: Probe) -> None:
-        """The gripper's path, what it met, and what became known, shown stronger for this probe."""
+        """Draw the gripper's path, contacts and new points, stronger for this probe."""
         path = probe.gripper_path
         self.add_points(probe.new_points)
         if probe.world_from_object is not None and self._first_pose is not None:
@@ -126,7 +126,7 @@ class Scene:
             self._stream.log("scene/hand", mesh_poses(pose))
 
     def show_modes(self, believed: Believed) -> None:
-        """Where the object's centre is in each mode: its ellipsoid of two standard deviations."""
+        """Draw the object's centre in each mode as an ellipsoid of two standard deviations."""
         places, half_sizes = ellipsoids(believed)
         modes = rr.Ellipsoids3D(
             centers=believed.centres,
@@ -144,18 +144,18 @@ class Scene:
 
 
 def mode_labels(believed: Believed) -> list[str]:
-    """The number and weight of each mode."""
+    """Return the number and weight of each mode."""
     modes = zip(believed.numbers, believed.weights, strict=True)
     return [f"mode {number}: {100.0 * weight:.0f} %" for number, weight in modes]
 
 
 def on_screen(radius: float) -> np.ndarray:
-    """A radius in points of the screen, however far away."""
+    """Return a radius in points of the screen, however far away."""
     return np.asarray(rr.Radius.ui_points(radius))
 
 
 def coarsened(mesh: trimesh.Trimesh | HandShape, most: int = _DISPLAY_FACES) -> trimesh.Trimesh:
-    """Vertices and faces alone, as an MCAP file keeps them, of a mesh for the eye."""
+    """Return vertices and faces alone, as an MCAP file keeps them, of a mesh for the eye."""
     import trimesh
 
     whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
@@ -165,7 +165,7 @@ def coarsened(mesh: trimesh.Trimesh | HandShape, most: int = _DISPLAY_FACES) -> 
 def display_mesh(
     mesh: trimesh.Trimesh, color: tuple[int, int, int, int] | None = None
 ) -> rr.Mesh3D:
-    """A mesh for the viewer, smoothly shaded; None leaves its colour open."""
+    """Return a mesh for the viewer, smoothly shaded; None leaves its colour open."""
     return rr.Mesh3D(
         vertex_positions=mesh.vertices,
         triangle_indices=mesh.faces,
@@ -175,20 +175,20 @@ def display_mesh(
 
 
 def mesh_poses(world_from_mesh: FloatArray) -> rr.InstancePoses3D:
-    """Where the mesh of an entity is drawn, once at each pose (N, 4, 4)."""
+    """Return the instances of the mesh of an entity, one at each pose (N, 4, 4)."""
     return rr.InstancePoses3D(
         translations=world_from_mesh[:, :3, 3], mat3x3=world_from_mesh[:, :3, :3]
     )
 
 
 def deepest(gripper_path: FloatArray) -> int:
-    """Index of the pose (P, 4, 4) that is furthest forward: along z of the first, the approach."""
+    """Return the index of the pose (P, 4, 4) furthest along z of the first, the approach."""
     advance = (gripper_path[:, :3, 3] - gripper_path[0, :3, 3]) @ gripper_path[0, :3, 2]
     return int(np.argmax(advance))
 
 
 class HypothesisMeshes:
-    """Draws sets of hypotheses under the entity `root`: one mesh a step of the scale, and poses."""
+    """Sets of hypotheses under the entity `root`: one mesh a step of the scale, and poses."""
 
     def __init__(self, stream: rr.RecordingStream, root: str = "scene/hypotheses") -> None:
         self._stream = stream
@@ -233,12 +233,12 @@ class HypothesisMeshes:
 
 
 def shown_hypotheses(hypotheses: Hypotheses) -> IntArray:
-    """Indices of the hypotheses that are drawn: no duplicates, the lowest in cost."""
+    """Return indices of the hypotheses that are drawn: no duplicates, the lowest in cost."""
     return np.flatnonzero(~hypotheses.duplicate)[:MOST]
 
 
 def cost_levels(cost: FloatArray, scale: CostScale | None = None) -> IntArray:
-    """The step of the cost scale, from 0, of each cost (B,); by default among its like."""
+    """Return the step of the cost scale, from 0, of each cost (B,); by default among its like."""
     fraction = (scale or CostScale.of(cost)).fraction(cost)
     return np.minimum((fraction * LEVELS).astype(np.int64), LEVELS - 1)
 

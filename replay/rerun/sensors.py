@@ -32,7 +32,7 @@ _CLASSES = {
 
 
 class SensorImages:
-    """Draws images under `sensors`, and depth cameras in the scene.
+    """Images under `sensors`, and depth cameras in the scene.
 
     At a probe, the picture of a camera is the last of that probe, and that of a pad the one with
     the largest contact; all others stand at moments of their own on the timeline of iterations.
@@ -59,7 +59,7 @@ class SensorImages:
         self._draw(image)
 
     def end_step(self) -> None:
-        """A probe's images are all there: show the largest contacts, and no touch from before."""
+        """Show the largest contacts of a probe whose images are complete, and none from before."""
         for sensor, best in self._touches.items():
             if best is None:
                 self._stream.log(f"sensors/{sensor}", rr.Clear(recursive=True))
@@ -85,7 +85,7 @@ class SensorImages:
             self._draw_camera(image, meter)
 
     def _draw_camera(self, image: SensorImage, meter: float) -> None:
-        """A depth camera where it stands, and the points that it sees."""
+        """Draw a depth camera at its pose, and the points that it sees."""
         entity, pose = f"scene/cameras/{image.sensor}", image.world_from_camera
         height, width = image.values.shape
         fx, fy, cx, cy = image.intrinsics.tolist()
@@ -110,7 +110,7 @@ class SensorImages:
 
 
 def pixel_classes(image: SensorImage) -> np.ndarray:
-    """Class of each pixel (H, W): it counts, it does not, or it measured nothing."""
+    """Return the class (H, W) of each pixel: it counts, does not, or measured nothing."""
     classes = np.where(image.mask, _COUNTS, _LEFT_OUT)
     if image.kind != DEFORMATION:
         classes[(image.values == 0) & ~image.mask] = _NOTHING
@@ -118,7 +118,7 @@ def pixel_classes(image: SensorImage) -> np.ndarray:
 
 
 def display_size(image: SensorImage) -> SensorImage:
-    """The image as it is drawn: every so many rows and columns of a larger one."""
+    """Return the image as it is drawn: every so many rows and columns of a larger one."""
     every = -(-max(image.values.shape) // _LONGEST_SIDE)
     return replace(
         image,

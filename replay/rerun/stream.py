@@ -20,9 +20,9 @@ _FLUSH_SECONDS = 10.0
 def new_stream(
     application: str, path: Path | None, viewer: rr.GrpcSink | None = None
 ) -> rr.RecordingStream:
-    """A stream without clocks to a new file, a viewer, or both.
+    """Return a stream without clocks to a new file, a viewer, or both.
 
-    Raises RecordingError if the file exists or cannot be written.
+    Raise RecordingError if the file exists or cannot be written.
     """
     sinks: list[rr.FileSink | rr.GrpcSink] = [] if viewer is None else [viewer]
     if path is not None:
@@ -45,9 +45,9 @@ def new_stream(
 
 @contextmanager
 def new_file_stream(path: Path, application: str) -> Iterator[rr.RecordingStream]:
-    """A stream into a new .rrd file that is finished with the block; removed if the block fails.
+    """Open a stream into a new .rrd file, finished with the block, removed if that fails.
 
-    Raises RecordingError if the file exists or cannot be written.
+    Raise RecordingError if the file exists or cannot be written.
     """
     stream = new_stream(application, path)
     try:
@@ -80,7 +80,7 @@ def flush(stream: rr.RecordingStream, path: Path | None, *, must: bool = True) -
 
 
 class Clock:
-    """Sets the times of what is logged.
+    """The times at which events are logged.
 
     On the timeline `probe` a moment is the step of a probe, and shows what was known and found by
     its end. On `iteration` it is a running count of the iterations of all stages of all
@@ -94,17 +94,17 @@ class Clock:
         self._stages: dict[str, int] = {}
 
     def set_probe(self, step: int) -> None:
-        """All that is logged from here on belongs to probe `step`."""
+        """Log from here on to probe `step`."""
         self._stream.set_time(PROBE, sequence=step)
         self._set_iteration(self.iteration)
 
     def tick(self) -> None:
-        """A registration starts, or a moment passes with something of its own to see."""
+        """Begin a registration, or a moment that has something of its own to see."""
         self._stages = {}
         self._set_iteration(self.iteration + 1)
 
     def advance(self, stage: str, iteration: int) -> None:
-        """A stage of this registration has done `iteration` iterations; stages come in turn."""
+        """Report that a stage has done `iteration` iterations; stages come in turn."""
         start = self._stages.setdefault(stage, self.iteration)
         self._set_iteration(max(self.iteration, start + iteration))
 

@@ -1,4 +1,4 @@
-"""What a session and its results are, as text for people."""
+"""Texts for people about a session and its results."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ COLORS = """
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes a value out each time, also where one object stands in two places."""
+    """A dumper of YAML that writes an object out at each of its places."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
 
 def session_markdown(started: SessionStarted) -> str:
-    """A table that says what was run, then the whole configuration, then where it ran."""
+    """Return a table that says what was run, then the whole configuration, then where it ran."""
     preset = _find(started.config, "preset")
     rows = {
         "object": started.object,
@@ -59,7 +59,7 @@ def session_markdown(started: SessionStarted) -> str:
 
 
 def costs_markdown(hypotheses: Hypotheses, scale: CostScale | None = None) -> str:
-    """How many hypotheses are drawn, and the costs at the ends of the scale of their colours."""
+    """Return how many hypotheses are drawn, and the costs at the ends of their colours."""
     shown = shown_hypotheses(hypotheses)
     scale = scale or CostScale.of(hypotheses.cost[shown])
     colors = f"cost {number(scale.low)} (yellow) to {number(scale.high)} (violet)"
@@ -67,7 +67,7 @@ def costs_markdown(hypotheses: Hypotheses, scale: CostScale | None = None) -> st
 
 
 def verdict_markdown(values: Mapping[str, float], known: int) -> str:
-    """How far to trust a result, by its measured values: the verdict large; "" without one.
+    """Return how far to trust a result, by its numbers: the verdict large; "" without one.
 
     known: the number of points of known signed distance.
     """
@@ -93,12 +93,12 @@ def verdict_markdown(values: Mapping[str, float], known: int) -> str:
 
 
 def literal(text: Any) -> str:
-    """Text that Markdown takes for nothing else."""
+    """Return text that Markdown takes for nothing else."""
     return re.sub(r"([\\`*_\[\]<>|#~$&])", r"\\\1", str(text))
 
 
 def _find(config: Mapping[str, Any], name: str) -> Any:
-    """The choice of a group at the top of the configuration or in its group `method`, or ""."""
+    """Return the choice of a group of the configuration or of its group `method`, or ""."""
     method = config.get("method")
     found = config.get(name) or (method.get(name) if isinstance(method, Mapping) else None)
     return (found.get("name") if isinstance(found, Mapping) else found) or ""

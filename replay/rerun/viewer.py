@@ -29,12 +29,12 @@ _SERVER_MEMORY = "50%"  # above its limit the server forgets what came first
 
 
 def has_screen() -> bool:
-    """Whether a window can be opened."""
+    """Return whether a window can be opened."""
     return sys.platform != "linux" or any(os.environ.get(name) for name in _SCREENS)
 
 
 def live_sink(port: int = LIVE_PORT) -> rr.GrpcSink | None:
-    """Where to send a live recording: a viewer that listens already, or one that is started.
+    """Return the sink of a live recording: a viewer that listens already, or a new one.
 
     None, with a warning, if there is no viewer and none can be started. The viewer outlives this
     process, so that its user can go on looking.
@@ -54,9 +54,9 @@ def live_sink(port: int = LIVE_PORT) -> rr.GrpcSink | None:
 
 @contextmanager
 def window(rrd: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """The viewer in a window; it ends with the block at latest.
+    """Return the viewer in a window; it ends with the block at latest.
 
-    Raises RecordingError if it cannot be started, or ends by an error.
+    Raise RecordingError if it cannot be started, or ends by an error.
     """
     port = free_port()
     with _viewer(
@@ -67,9 +67,9 @@ def window(rrd: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 @contextmanager
 def web_server(rrd: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """A server of the viewer to browsers on this machine, and the address; it ends with the block.
+    """Open a server of the viewer to browsers on this machine, which ends with the block.
 
-    Raises RecordingError if it cannot be started, or ends by an error.
+    Raise RecordingError if it cannot be started, or ends by an error.
     """
     page, data = free_port(), free_port()
     ports = ["--web-viewer-port", str(page), "--port", str(data)]
@@ -79,24 +79,24 @@ def web_server(rrd: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
 
 
 def viewer_program() -> Path:
-    """The viewer itself; the `rerun` command is a wrapper that outlives or orphans it."""
+    """Return the viewer itself; the `rerun` command is a wrapper that outlives or orphans it."""
     return Path(rerun_cli.__file__).parent / "rerun"
 
 
 def viewer_url(port: int) -> str:
-    """Where a viewer that listens at a port takes data and orders."""
+    """Return the address at which a viewer that listens at a port takes data and orders."""
     return f"rerun+http://{HOST}:{port}/proxy"
 
 
 def is_listening(port: int) -> bool:
-    """Whether anything listens at a port of this machine."""
+    """Return whether anything listens at a port of this machine."""
     with socket.socket() as probe:
         probe.settimeout(0.5)
         return probe.connect_ex((HOST, port)) == 0
 
 
 def free_port() -> int:
-    """A port of this machine that nobody listens at."""
+    """Return a port of this machine that nobody listens at."""
     with socket.socket() as probe:
         probe.bind((HOST, 0))
         return int(probe.getsockname()[1])
@@ -104,7 +104,7 @@ def free_port() -> int:
 
 @contextmanager
 def _viewer(options: list[str], *ports: int) -> Iterator[subprocess.Popen[bytes]]:
-    """A viewer that listens at ports until the end of the block, whatever ends it."""
+    """Return a viewer that listens at ports until the end of the block, whatever ends it."""
     with tempfile.TemporaryFile("w+") as output:
         viewer = _start(options, output, *ports)
         try:
@@ -122,7 +122,7 @@ def _viewer(options: list[str], *ports: int) -> Iterator[subprocess.Popen[bytes]
 def _start(
     options: list[str], output: IO[str], *ports: int, outlives: bool = False
 ) -> subprocess.Popen[bytes]:
-    """A viewer, once it listens at all ports. Raises RecordingError if it does not."""
+    """Return a viewer, once it listens at all ports. Raise RecordingError if it does not."""
     command = [str(viewer_program()), "--bind", HOST, *options]
     try:
         viewer = subprocess.Popen(
@@ -144,7 +144,7 @@ def _start(
 
 
 def _last_line(output: IO[str]) -> str:
-    """The last line that the viewer printed, which says why it ended."""
+    """Return the last line that the viewer printed, which says why it ended."""
     output.seek(0)
     lines = [line.strip() for line in output if line.strip()]
     return lines[-1][-300:] if lines else "it says nothing"

@@ -53,7 +53,7 @@ def session_blueprint(
     sensors: Mapping[str, str] | None = None,
     steered: bool = False,
 ) -> rrb.Blueprint:
-    """Scene, archive and text above, curves below.
+    """Return the layout: scene, archive and text above, curves below.
 
     curves: entities of TITLES that have something to show. archive: width and height of the heat
     map in cells, if there is one. sensors: titles of the pictures beside all, by sensor.
@@ -82,7 +82,7 @@ def session_blueprint(
 
 
 def at_last_probe(views: rrb.Container) -> rrb.Blueprint:
-    """The views alone, all panels collapsed, at the last probe and following what comes."""
+    """Return the views alone, all panels collapsed, at the last probe and following what comes."""
     time = rrb.TimePanel(
         state="collapsed", timeline=PROBE, play_state="following", fps=_PROBES_PER_SECOND
     )
@@ -96,7 +96,7 @@ def scene_view(
     more: Sequence[str] = (),
     distance: float = 1.0,
 ) -> rrb.Spatial3DView:
-    """The scene, looked at obliquely from where the probes come from.
+    """Return the scene, looked at obliquely from where the probes come from.
 
     more: entities beside it that the view shows too, each with all below it. distance: of the eye,
     times what has the workspace in sight.
@@ -127,7 +127,7 @@ def scene_view(
 
 
 def curves_view(root: str, name: str, *, legend: bool = True) -> rrb.TimeSeriesView:
-    """The curves under the entity `root`."""
+    """Return the curves under the entity `root`."""
     return rrb.TimeSeriesView(
         origin=f"/{root}",
         name=name,
@@ -140,7 +140,7 @@ def _session_curves(root: str) -> rrb.TimeSeriesView:
 
 
 def _archive_view(width: int, height: int) -> rrb.Spatial2DView:
-    """The heat map; the mouse finds its costs, not its colours."""
+    """Return the heat map; the mouse finds its costs, not its colours."""
     room = 0.2 * max(width, height)  # for the text
     return rrb.Spatial2DView(
         origin="/archive",
@@ -173,7 +173,7 @@ def _text_views() -> rrb.Container:
 
 
 def _up_to_now() -> rrb.VisibleTimeRanges:
-    """All moments from the first one to that of the cursor, on every timeline."""
+    """Return all moments from the first one to that of the cursor, on every timeline."""
     start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative(seq=0)
     return rrb.VisibleTimeRanges(
         [rrb.VisibleTimeRange(name, start=start, end=end) for name in (PROBE, ITERATION)]

@@ -1,4 +1,4 @@
-"""What can be done with a recording: a module a verb, each with add_arguments and run."""
+"""The verbs of `python -m replay`: a module each, with add_arguments and run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def _summary(module: Path) -> str:
-    """The first line of a module, which is read, not imported: that would take seconds."""
+    """Return the first line of a module, which is read, not imported: that would take seconds."""
     return (ast.get_docstring(ast.parse(module.read_bytes())) or "").partition("\n")[0]
 
 
@@ -16,4 +16,4 @@ VERBS = {
     for module in sorted(Path(__file__).parent.glob("*.py"))
     if module.stem != "__init__"
 }
-"""All verbs, with what each does."""
+"""Verbs, with what each does."""

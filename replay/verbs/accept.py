@@ -41,7 +41,7 @@ from replay.mcap.writer import McapRecorder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Files, and whether to ask."""
+    """Add files, and whether to ask."""
     parser.add_argument("files", nargs="+", metavar="FILE", help="recordings, or folders of them")
     parser.add_argument("--yes", action="store_true", help="do not ask")
 
@@ -81,7 +81,7 @@ def _accept(path: Path, *, ask: bool) -> int:
 
 
 def _table(title: str, changes: Sequence[ResultChange]) -> Table:
-    """A row for each registration whose result changes."""
+    """Return a row for each registration whose result changes."""
     table = plain_table(title, texts=["step", "up to", "best pose moves", *_NUMBERS])
     for change in changes:
         position, rotation = change.moved
@@ -107,7 +107,7 @@ _NUMBERS = {
 
 @dataclass(frozen=True)
 class ResultChange:
-    """How a result differs from the recorded one.
+    """The change of a result from the recorded one.
 
     Numbers are those measured, best_cost, and where the plausible set of the step lies beside the
     recording coverage, plausibility and diversity in mm^2.

@@ -50,7 +50,7 @@ _PLAUSIBLE = ("coverage", "plausibility", "diversity")  # which have tables of t
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The file, its steps, the methods with their settings, and what to save."""
+    """Add the file, its steps, the methods with their settings, and what to save."""
     parser.add_argument("file", type=path_argument, metavar="FILE", help="a recording")
     which = parser.add_mutually_exclusive_group(required=True)
     for option, kind in (("--methods", "METHOD"), ("--policies", "POLICY")):
@@ -155,7 +155,7 @@ def _compare_policies(given: argparse.Namespace, recording: Recording) -> int:
 
 
 def _checked_outputs(given: argparse.Namespace) -> list[Path]:
-    """The files to write. Raises before any work what would make it end in nothing."""
+    """Return the files to write. Raises before any work what would make it end in nothing."""
     paths = (given.out, given.save_csv, given.save_plot, given.save_rerun)
     outputs = [path for path in paths if path is not None]
     for path in outputs:
@@ -177,7 +177,7 @@ def _checked_outputs(given: argparse.Namespace) -> list[Path]:
 def _print_tables(
     console: Console, what: str, columns: Sequence[Column], rows: pd.DataFrame, *, each: bool
 ) -> None:
-    """A row for each step and method if wanted, and the medians over several steps."""
+    """Print a row for each step and method if wanted, and medians over several steps."""
     headings, count = [column.heading for column in columns], rows["step"].nunique()
     if each:
         table = plain_table(f"each step, {what}", texts=["step", "method"], numbers=headings)
@@ -205,7 +205,7 @@ def _shown_number(value: float | None, times: float = 1.0) -> str:
 
 
 def _decision_table(rows: pd.DataFrame) -> Table:
-    """A row for each step and policy: the action with start and direction, and its forecasts."""
+    """Return a table of steps and policies: actions with start, direction and forecasts."""
     numbers = ("action", "start, mm", "along", "score", "hit\nchance", "then\nmm")
     title = "each step, problems as recorded; then: spread of the belief, expected after the action"
     table = plain_table(title, texts=["step", "policy"], numbers=numbers)
@@ -224,7 +224,7 @@ def _decision_table(rows: pd.DataFrame) -> Table:
 
 
 def _decision_medians(rows: pd.DataFrame) -> Table:
-    """A row for each policy, over all steps."""
+    """Return a row for each policy, over all steps."""
     numbers = ("steps", "as\nrecorded", "stops", "hit\nchance", "then\nmm")
     table = plain_table("medians of the chosen actions", texts=["policy"], numbers=numbers)
     for label, own in rows.groupby("label", sort=False):
@@ -254,7 +254,7 @@ def _print_bits(console: Console, choice: Choice[Method], outcomes: Sequence[Out
 
 
 def _print_rest(console: Console, choices: Sequence[Choice[Any]], rows: pd.DataFrame) -> None:
-    """The changes of settings, and what failed."""
+    """Print the changes of settings, and what failed."""
     for choice in choices:
         if choice.changes:
             console.print(f"{choice.label} with {', '.join(choice.changes)}", soft_wrap=True)
@@ -263,14 +263,14 @@ def _print_rest(console: Console, choices: Sequence[Choice[Any]], rows: pd.DataF
 
 
 def _results(recording: Recording, outcomes: Sequence[Outcome]) -> dict[str, dict[int, Hypotheses]]:
-    """Hypotheses by label and step; without the recorded ones if a method has them all again."""
+    """Return hypotheses by label and step; recorded ones only if no method has them all."""
     results: dict[str, dict[int, Hypotheses]] = {}
     for outcome in outcomes:
         if outcome.hypotheses is not None:
             results.setdefault(outcome.label, {})[outcome.step] = outcome.hypotheses
-    again = {outcome.label for outcome in outcomes if outcome.as_recorded}
-    again -= {outcome.label for outcome in outcomes if not outcome.as_recorded}
-    if again:
+    repeated = {outcome.label for outcome in outcomes if outcome.as_recorded}
+    repeated -= {outcome.label for outcome in outcomes if not outcome.as_recorded}
+    if repeated:
         results.pop(recorded_label(recording), None)
     return results
 
@@ -309,7 +309,7 @@ def write_plot(path: Path, rows: pd.DataFrame, columns: Sequence[Column], title:
 def policy_decisions(
     recording: Recording, policies: Sequence[Choice[Policy]], steps: Sequence[int]
 ) -> Iterator[dict[str, Any]]:
-    """A row of a table for each step and policy, the recorded decision first; with their units.
+    """Yield a row for each step and policy, the recorded decision first; names have units.
 
     step, label, failure, changes (to the settings, with "; " between), chosen (action), stop,
     spread_m, then of the chosen action, where there is one, start (x_m to z_m), direction (dx to

@@ -26,7 +26,7 @@ BOTH, FIRST, SECOND = "both", "first", "second"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Two files, and what to leave out."""
+    """Add two files, and what to leave out."""
     parser.add_argument("first", type=path_argument, metavar="A", help="a recording")
     parser.add_argument("second", type=path_argument, metavar="B", help="another one")
     parser.add_argument("--all", action="store_true", help="list every difference")
@@ -60,7 +60,7 @@ def run(given: argparse.Namespace) -> int:
 
 
 def _table(found: RecordingDiff) -> Table:
-    """A row for each topic with a difference."""
+    """Return a row for each topic with a difference."""
     table = plain_table(
         texts=("topic", "steps", "fields"),
         numbers=("differ", "of", "only\nin A", "only\nin B", "largest\nulp"),
@@ -83,7 +83,7 @@ def _table(found: RecordingDiff) -> Table:
 
 
 class Place(NamedTuple):
-    """What two events have in common to be compared."""
+    """The place of an event, which is that of the event that it is compared with."""
 
     topic: str
     step: int
@@ -109,7 +109,7 @@ class EventDifference(Difference):
 
 @dataclass
 class RecordingDiff:
-    """All that differs between two recordings."""
+    """The differences between two recordings."""
 
     same_bytes: bool  # whether the files are equal
     counts: Counter[str] = field(default_factory=Counter)  # events on each topic in either
@@ -120,7 +120,7 @@ def recording_diff(first: Path, second: Path, ignored: Sequence[str] = ()) -> Re
     """Compare two recordings, step by step.
 
     ignored: topics, such as "/timed", and fields with what is nested in them, such as
-    "environment" or "config.seed". Raises RecordingError if a file cannot be read.
+    "environment" or "config.seed". Raise RecordingError if a file cannot be read.
     """
     recordings = [read_recording(path) for path in (first, second)]
     found = RecordingDiff(filecmp.cmp(recordings[0].path, recordings[1].path, shallow=False))
@@ -141,7 +141,7 @@ def recording_diff(first: Path, second: Path, ignored: Sequence[str] = ()) -> Re
 
 
 def _steps(recording: Recording, side: int) -> Iterator[tuple[int, int, dict[Place, Content]]]:
-    """What the events of each step say, by their places."""
+    """Yield the contents of the events of each step, by their places."""
     for step, events in groupby(recording.events(), lambda event: event.step):
         contents: dict[Place, Content] = {}
         numbers: Counter[tuple[str, int, str]] = Counter()

@@ -51,7 +51,7 @@ class Exported(NamedTuple):
 
 
 def exported_hypotheses(recording: Recording, steps: str | None) -> Exported:
-    """The hypotheses of each step, best first.
+    """Return the hypotheses of each step, best first.
 
     npz: `steps` (S,), the steps that have some; `step_K/object_from_world` (B, 4, 4),
     `step_K/cost` (B,), `step_K/duplicate` (B,), `step_K/cell` (B,); `true_world_from_object`
@@ -85,7 +85,7 @@ def exported_hypotheses(recording: Recording, steps: str | None) -> Exported:
 
 
 def exported_points(recording: Recording, steps: str | None) -> Exported:
-    """The points that became known at each step, in their order, as `session=points` reads them.
+    """Return the points that became known at each step, in order, as `session=points` reads them.
 
     npz: `free` (N, 3), `occupied` (K, 3), `known` (M, 3), metres, with `known_sdf` (M,), the steps
     `free_step`, `occupied_step`, `known_step`, and `world_from_object` (4, 4) where it is known.
@@ -115,7 +115,7 @@ def exported_points(recording: Recording, steps: str | None) -> Exported:
 
 
 def exported_archive(recording: Recording, steps: str | None) -> Exported:
-    """The archive over each registration; the last snapshot of a step is that of its result.
+    """Return the archive over each registration; the last snapshot of a step is that of its result.
 
     npz: `steps` (S,); for snapshot I of step K, `step_K/snapshot_I/` with `iteration`,
     `refinement`, `measure_names` (k,), `shape` (k,), `lower` (k,), `upper` (k,), `cells` (C,),
@@ -144,7 +144,7 @@ def exported_archive(recording: Recording, steps: str | None) -> Exported:
 
 
 def exported_metrics(recording: Recording, steps: str | None) -> Exported:
-    """Every recorded number about a step: a row a number, in all three forms.
+    """Return every recorded number about a step: a row a number, in all three forms.
 
     source: "contents" for counts of what is known and found, and the best cost; "measured" for
     numbers about the result, in SI units where the name has none; "timed" for seconds.
@@ -169,7 +169,7 @@ def exported_metrics(recording: Recording, steps: str | None) -> Exported:
 
 
 def exported_images(recording: Recording, steps: str | None) -> Exported:
-    """The depth and deformation images of each step's sensors, in their order.
+    """Return the depth and deformation images of each step's sensors, in their order.
 
     npz: `steps` (S,), those with images; for image I of sensor NAME at step K, `step_K/NAME_I/`
     with `values` (H, W), `unit` (metres that 1 stands for; 0 is no measurement), `mask` (H, W),
@@ -196,7 +196,7 @@ def exported_images(recording: Recording, steps: str | None) -> Exported:
 
 
 def exported_decisions(recording: Recording, steps: str | None) -> Exported:
-    """The decisions of a steered session, one after each step, -1 for that before the first probe.
+    """Return the decisions of a session, one after each step, -1 before the first probe.
 
     npz: `steps` (S,); `actions/world_from_hand` (A, 4, 4), `actions/length` (A,), metres, and
     where it is known `actions/seconds` (A,); `step_K/chosen`, the index of the action taken, -1
@@ -239,13 +239,13 @@ def exported_decisions(recording: Recording, steps: str | None) -> Exported:
 
 
 def _parts_of(actions: Actions) -> dict[str, FloatArray]:
-    """The arrays of actions by their names, those that are there."""
+    """Return the arrays of actions by their names, those that are there."""
     parts = {field.name: getattr(actions, field.name) for field in fields(actions)}
     return {name: part for name, part in parts.items() if part is not None}
 
 
 def exported_modes(recording: Recording, steps: str | None) -> Exported:
-    """The modes of each recorded belief; of a recording without one those of each result, computed.
+    """Return the modes of each recorded belief, or without one those computed of each result.
 
     npz: `steps` (S,); of step K `step_K/numbers` (M,), the same for a mode at all steps,
     `step_K/weights` (M,), `step_K/object_from_world` (M, 4, 4), `step_K/centres` (M, 3), of the
@@ -254,13 +254,13 @@ def exported_modes(recording: Recording, steps: str | None) -> Exported:
     position_deviation (metres) and rotation_deviation (radians) roots of the covariance's traces,
     m00 to m33 object_from_world.
     """
-    told = {e.step: e for e in recording.events(images=False) if isinstance(e, Believed)}
-    told = told or {e.step: e for e in _beliefs(recording)}
-    chosen = _chosen(recording, steps, [*told], "belief")
+    believed = {e.step: e for e in recording.events(images=False) if isinstance(e, Believed)}
+    believed = believed or {e.step: e for e in _beliefs(recording)}
+    chosen = _chosen(recording, steps, [*believed], "belief")
     arrays: dict[str, Any] = {"steps": np.array(chosen, dtype=np.int64)}
     tables = []
     for step in chosen:
-        parts = {name: part for name, part in vars(told[step]).items() if name != "step"}
+        parts = {name: part for name, part in vars(believed[step]).items() if name != "step"}
         arrays |= {f"step_{step}/{name}": part for name, part in parts.items()}
         squares = np.diagonal(parts["covariances"], axis1=1, axis2=2)
         columns = {
@@ -276,7 +276,7 @@ def exported_modes(recording: Recording, steps: str | None) -> Exported:
 
 
 def _beliefs(recording: Recording) -> Iterator[Believed]:
-    """The beliefs of all results that have a pose."""
+    """Yield the beliefs of all results that have a pose."""
     results = [step for step in recording.steps if recording.has_result(step)]
     beliefs = BeliefSequence(recording) if results else None
     for step in results:
@@ -295,11 +295,11 @@ EXPORTS = {
     "images": exported_images,
     "decisions": exported_decisions,
 }
-"""By the name that `--what` takes."""
+"""Exports by the name that `--what` takes."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """What, of which steps, in which form, where."""
+    """Add what to export, of which steps, in which form, where."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = "\n\n".join(f"{name}: {inspect.getdoc(of)}" for name, of in EXPORTS.items())
     parser.add_argument("file", metavar="FILE", help="a recording")
@@ -351,19 +351,19 @@ def write_export(exported: Exported, path: Path, file_format: str) -> None:
 def _chosen(
     recording: Recording, steps: str | None, existing: Sequence[int], name: str
 ) -> tuple[int, ...]:
-    """The chosen ones of the steps that have what is asked for; RecordingError if none has."""
+    """Return the chosen steps that have what is asked for; raise RecordingError if none has."""
     if not existing:
         raise RecordingError(f"recording {recording.path} has no {name}; accepted: one with some")
     return chosen_steps(steps, existing)
 
 
 def _entries(matrices: FloatArray) -> dict[str, Any]:
-    """The entries of matrices (..., 4, 4), each by its row and column."""
+    """Return the entries of matrices (..., 4, 4), each by its row and column."""
     return {f"m{row}{column}": matrices.T[column, row] for row, column in np.ndindex(4, 4)}
 
 
 def _archives(recording: Recording, step: int) -> list[ArchiveSnapshot]:
-    """The snapshots of a step, and its last archive if that is not among them."""
+    """Return the snapshots of a step, and its last archive if that is not among them."""
     taken = recording.snapshots(step)
     final = recording.hypotheses(step).archive if recording.has_result(step) else None
     if final is not None and not any(snapshot is final for snapshot in taken):
@@ -372,7 +372,7 @@ def _archives(recording: Recording, step: int) -> list[ArchiveSnapshot]:
 
 
 def _numbered(recording: Recording, steps: Sequence[int]) -> Iterator[tuple[int, SensorImage]]:
-    """The images of some steps, one at a time, each with its number of its sensor and step."""
+    """Yield the images of some steps one at a time, each with its number in sensor and step."""
     counts: Counter[tuple[int, str]] = Counter()
     for seen in recording.sensor_images(steps):
         yield counts[seen.step, seen.sensor], seen
@@ -387,7 +387,7 @@ def _image_arrays(recording: Recording, steps: Sequence[int]) -> Iterator[tuple[
 
 
 def _format(named: str | None, out: Path | None) -> str:
-    """The format that is asked for, by its name or by that of the file."""
+    """Return the format that is asked for, by its name or by that of the file."""
     suffix = out.suffix.lower().removeprefix(".") if out is not None else ""
     if out is not None and suffix not in FORMATS:
         accepted = ", ".join(f".{name}" for name in FORMATS)

@@ -37,7 +37,7 @@ _LONGEST_HEADER = 4096  # bytes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Files, and as what."""
+    """Add files, and the form of the output."""
     parser.add_argument("files", nargs="+", metavar="FILE", help="recordings, or any MCAP files")
     parser.add_argument("--json", action="store_true", help="print all as one JSON document")
 
@@ -65,9 +65,9 @@ def run(given: argparse.Namespace) -> int:
 
 
 def recording_info(path: str | Path) -> dict[str, Any]:
-    """What is in a recording, every checksum and digest compared, as JSON has it.
+    """Return the contents of a recording as JSON has them, with every checksum and digest compared.
 
-    Of a damaged one, all is read that is whole. Raises RecordingError if nothing can be read.
+    Of a damaged one, all is read that is whole. Raise RecordingError if nothing can be read.
     """
     path = Path(path).expanduser()
     recording = read_recording(path, partial=True)
@@ -121,7 +121,7 @@ def recording_info(path: str | Path) -> dict[str, Any]:
 
 
 def step_rows(recording: Recording) -> list[dict[str, Any]]:
-    """A row for each probe: all points known with it, and what the registration after it gave.
+    """Return a row for each probe: all points known with it, and the numbers of its result.
 
     hypotheses, distinct and best_cost are None without a result.
     """
@@ -144,7 +144,7 @@ def step_rows(recording: Recording) -> list[dict[str, Any]]:
 
 
 def is_other_programs(path: str | Path) -> bool:
-    """Whether a file is a robot's: MCAP, by its header not a recording of ours, or of ROS."""
+    """Return whether a file is a robot's log: MCAP whose header is not ours, or of ROS."""
     path = Path(path).expanduser()
     if not path.is_file():  # a FIFO would be waited for
         return False
@@ -160,10 +160,10 @@ def is_other_programs(path: str | Path) -> bool:
 
 
 def log_info(path: str | Path) -> dict[str, Any]:
-    """What is in an MCAP file of any program, by its summary; without one, everything is read.
+    """Return the contents of any program's MCAP file, by its summary or else by reading it all.
 
     begin and end: first and last log time, nanoseconds, 0 without messages; rate: messages a
-    second over that span. Raises SessionError for a file that cannot be read, or is not MCAP.
+    second over that span. Raise SessionError for a file that cannot be read, or is not MCAP.
     """
     file, faults = RawFile(Path(path).expanduser()), list[str]()
     counts: Counter[Channel] = Counter()
@@ -198,7 +198,7 @@ def log_info(path: str | Path) -> dict[str, Any]:
 
 
 def _name(config: Mapping[str, Any], group: str) -> str | None:
-    """What a configuration has chosen of a group."""
+    """Return the choice of a group in a configuration."""
     chosen = config.get(group)
     return str(chosen.get("name", "")) if isinstance(chosen, Mapping) else None
 
@@ -237,7 +237,7 @@ def _recording_tables(info: Mapping[str, Any]) -> tuple[Table, Table]:
 
 
 def _fact_table(facts: Mapping[str, str | None]) -> Table:
-    """Names and what they are, without those of which nothing is known."""
+    """Return a table of names and facts, without those of which nothing is known."""
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")
@@ -248,7 +248,7 @@ def _fact_table(facts: Mapping[str, str | None]) -> Table:
 
 
 def _facts(info: Mapping[str, Any]) -> dict[str, str]:
-    """Names and what they are, but for the steps."""
+    """Return facts by their names, but for the steps."""
     preset = f", preset {info['preset']}" if info["preset"] else ""
     steps = f"probes {len(info['steps'])}, registrations {info['registrations']}"
     files = ", ".join(f"{name} {decimal(size)}" for name, size in info["attachments"].items())
@@ -282,7 +282,7 @@ def _facts(info: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _policy(info: Mapping[str, Any]) -> str:
-    """The policy of a steered session, and how it stopped; empty if there is none."""
+    """Return the policy of a steered session, and how it stopped; empty if there is none."""
     if info["policy"] is None:
         return ""
     stop, spread = info["policy"]["stop"], info["policy"]["spread"]

@@ -13,7 +13,7 @@ from replay.mcap.recovery import recover
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The damaged file and the new one."""
+    """Add the damaged file and the new one."""
     parser.add_argument("file", metavar="FILE", type=path_argument, help="a recording.mcap")
     parser.add_argument(
         "-o",

@@ -20,7 +20,7 @@ from replay.verbs import compare
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The file, its step, the method with its settings, and what to write."""
+    """Add the file, its step, the method with its settings, and what to write."""
     parser.add_argument("file", type=path_argument, metavar="FILE", help="a recording")
     parser.add_argument("--step", type=int, required=True, metavar="K", help="a recorded problem")
     parser.add_argument(
@@ -73,7 +73,7 @@ def run(given: argparse.Namespace) -> int:
 
 
 def _policies(groups: list[list[str]]) -> list[str]:
-    """`--policy NAME KEY=VALUE --policy NAME` as `compare --policies` takes it."""
+    """Return `--policy NAME KEY=VALUE --policy NAME` as `compare --policies` takes it."""
     words: list[str] = []
     counts: Counter[str] = Counter()
     for name, *changes in groups:

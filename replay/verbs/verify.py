@@ -23,7 +23,7 @@ from replay.console import Console, print_error
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Files, steps, processes."""
+    """Add files, steps, processes."""
     parser.add_argument("files", nargs="+", metavar="FILE", help="recordings, or folders of them")
     parser.add_argument(
         "--step", type=int, action="append", metavar="K", help="this step alone; may be repeated"

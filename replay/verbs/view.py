@@ -1,4 +1,4 @@
-"""Make the Rerun recording anew from the MCAP file alone, and open it or save it."""
+"""Make the Rerun recording from the MCAP file alone, and open it or save it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ENDINGS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(s
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """What to look at, and where."""
+    """Add what to look at, and where."""
     parser.add_argument("file", type=path_argument, metavar="FILE", help="a recording.mcap")
     where = parser.add_mutually_exclusive_group()
     where.add_argument(

@@ -1,1 +1,1 @@
-"""What `python -m runners.benchmark` measures, and how it reports it."""
+"""Measurements of `python -m runners.benchmark`, and their report."""

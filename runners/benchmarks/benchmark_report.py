@@ -1,4 +1,4 @@
-"""What a benchmark found: as JSON, and as a page of tables; docs/speed.md is one."""
+"""The results of a benchmark as JSON, and as a page of tables; docs/speed.md is one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _VERSIONS = ("numpy", "torch", "numba")
 
 
 def write(folder: Path, rows: Sequence[Row], about: Mapping[str, Any]) -> None:
-    """All numbers as benchmark.json, and speed.md. about: machine and settings."""
+    """Write all numbers as benchmark.json, and speed.md. about: machine and settings."""
     report = {**about, "rows": [row.mapping() for row in rows]}
     write_in_run_folder(folder / "benchmark.json", json.dumps(report, indent=2) + "\n")
     lines = ["# Speed", "", "Written by `python -m runners.benchmark`.", "", *page(rows, about)]
@@ -24,7 +24,7 @@ def write(folder: Path, rows: Sequence[Row], about: Mapping[str, Any]) -> None:
 
 
 def page(rows: Sequence[Row], about: Mapping[str, Any]) -> list[str]:
-    """The tables in Markdown, which a terminal shows as well."""
+    """Return the tables in Markdown, which a terminal shows as well."""
     machine = about["machine"]
     versions = [f"{name} {machine[f'package {name}']}" for name in _VERSIONS]
     lines = [f"{machine['processor']}, {machine['cores']} cores, load {machine['load']:.2f}", ""]
@@ -50,7 +50,7 @@ def page(rows: Sequence[Row], about: Mapping[str, Any]) -> list[str]:
 
 
 def slower(rows: Sequence[Row], row: Row, package: str) -> float | None:
-    """How many times as long as one of ours the package takes on the same problem."""
+    """Return how many times as long as one of ours the package takes on the same problem."""
     beside = [other for other in rows if (other.case, other.who) == (row.case, package)]
     if row.who.startswith(PACKAGE) or not beside:
         return None
@@ -76,7 +76,7 @@ def _numbers(row: Row) -> dict[str, str]:
 
 
 def _table(lines: Sequence[Mapping[str, str]]) -> list[str]:
-    """A table of Markdown whose columns are as wide as their widest cell."""
+    """Return a table of Markdown whose columns are as wide as their widest cell."""
     cells = [list(lines[0]), *(list(line.values()) for line in lines)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     rows = [" | ".join(map(str.ljust, row, widths)) for row in cells]

@@ -1,4 +1,4 @@
-"""What is timed: registrations by this library and by the published package, and other calls."""
+"""Timed calls: registrations by this library and by the published package, and others."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _THREADS = (1, 2)
 
 @dataclass(frozen=True)
 class Steps(CheckedSettings):
-    """How much registrations do that are compared with the package, none of which stops early."""
+    """The amount of work of registrations beside the package, none of which stops early."""
 
     restarts: Annotated[int, positive] = 10  # of descent
     adam: Annotated[int, positive] = 50  # Adam steps of a restart
@@ -58,7 +58,7 @@ store("effort", "default", settings_mapping(Steps()))
 
 @dataclass(frozen=True)
 class Scope:
-    """How much is measured."""
+    """The amount of what is measured."""
 
     steps: Steps
     repeats: int
@@ -88,7 +88,7 @@ class Row:
         return float(lower), float(upper)
 
     def mapping(self) -> dict[str, Any]:
-        """The row as the report's file has it."""
+        """Return the row as the report's file has it."""
         return {**asdict(self), "median": self.median, "quartiles": self.quartiles}
 
 
@@ -107,7 +107,7 @@ def in_turn(
 
 
 def milliseconds(run: Callable[[], object], count: int = 1) -> float:
-    """What a run takes on so many threads."""
+    """Return the milliseconds of a run on so many threads."""
     with on_threads(count):
         begun = time.perf_counter()
         run()
@@ -148,13 +148,13 @@ def pose(problem: Problem, seed: int) -> RegistrationProblem:
 
 @lru_cache
 def drill(scale: float) -> tuple[trimesh.Trimesh, SdfGrid]:
-    """The mesh of the model, and its signed distance grid."""
+    """Return the mesh of the model, and its signed distance grid."""
     mesh = load_object(ObjectConfig("drill", scale, 0.001, "drill"), Path()).mesh
     return mesh, SdfGrid.from_mesh(mesh, _SDF_RESOLUTION)
 
 
 def standing(mesh: trimesh.Trimesh) -> FloatArray:
-    """world_from_object (4, 4): turned, on the floor in the middle of the workspace."""
+    """Return world_from_object (4, 4): turned, on the floor in the middle of the workspace."""
     lower, upper = np.asarray(mesh.bounds)
     turn = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(_YAW))
     foot = np.array([*(lower + upper)[:2] / 2.0, lower[2]])
@@ -163,7 +163,7 @@ def standing(mesh: trimesh.Trimesh) -> FloatArray:
 
 
 def _outside(mesh: trimesh.Trimesh, world_from_object: FloatArray, spacing: float) -> FloatArray:
-    """The points (N, 3) of a lattice in the workspace that are outside of the object."""
+    """Return the points (N, 3) of a lattice in the workspace that are outside of the object."""
     # At whole multiples of the spacing, where the published package has its voxels, too.
     lower, upper = WORKSPACE.bounds
     first, last = np.ceil(lower / spacing), np.floor(upper / spacing)
@@ -190,11 +190,11 @@ OURS = (*PRESETS, *SIZES)
 
 
 class BenchmarkError(ChselError):
-    """Both sides would not do the same work."""
+    """The error that both sides would not do the same work."""
 
 
 def method(name: str, steps: Steps, search: int) -> Method:
-    """One of OURS: with all steps done, or as it ships but for a search that is longer."""
+    """Return one of OURS: with all steps done, or as it ships but for a search that is longer."""
     if name in SIZES:
         settings = replace(preset_settings("anchored"), size=name.removeprefix("anchored, "))
         return build_method("anchored", settings)
@@ -216,7 +216,7 @@ def register(
     search: int,
     observer: Observer | None = None,
 ) -> tuple[float, Hypotheses]:
-    """Milliseconds from arrays to hypotheses by one of OURS, and these; the SDF grid is there."""
+    """Return milliseconds from arrays to hypotheses by one of OURS, and these."""
     begun = time.perf_counter()
     fresh = replace(problem, points=replace(problem.points))  # which has nothing computed yet
     found = method(name, steps, search).register(fresh, observer)
@@ -226,7 +226,7 @@ def register(
 def compare(
     name: str, scope: Scope, package: PublishedPackage | None, *, equation: bool
 ) -> Iterator[Row]:
-    """Rows of one of PROBLEMS: OURS, and in turn with them the package.
+    """Yield rows of one of PROBLEMS: OURS, and in turn with them the package.
 
     The first registration of everyone is not counted. equation: the package with the paper's own
     free term as well, a third as often, the first one included. cost: of the best pose under the
@@ -280,14 +280,14 @@ class StageTimer(NullObserver):
         self._mark = time.perf_counter()
 
     def progress(self, stage: str, iteration: int, total: int) -> None:
-        """The time since the last report is the stage's."""
+        """Count the time since the last report for the stage."""
         now = time.perf_counter()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._mark
         self._mark = now
 
 
 def stages(scope: Scope) -> Iterator[Row]:
-    """Adam, search, and all else of a registration."""
+    """Yield adam, search, and all else of a registration."""
     problem = pose(PROBLEMS["real_20"], scope.seed)
     for name in (*PRESETS, "anchored, adaptive"):
         parts: dict[str, list[float]] = {}
@@ -302,7 +302,7 @@ def stages(scope: Scope) -> Iterator[Row]:
 
 
 def threads(scope: Scope) -> Iterator[Row]:
-    """One and two threads, in turn, and how many times as fast two are."""
+    """Yield one and two threads, in turn, and how many times as fast two are."""
     for case in ("real_20", "large_20"):
         problem = pose(PROBLEMS[case], scope.seed)
         for name in (*PRESETS, "anchored, medium"):
@@ -317,7 +317,7 @@ def threads(scope: Scope) -> Iterator[Row]:
 
 
 def methods(scope: Scope) -> Iterator[Row]:
-    """Every method in preset default, stopping when it does, in turn."""
+    """Yield every method in preset default, stopping when it does, in turn."""
     problem = pose(PROBLEMS["real_20"], scope.seed)
 
     def register_with(name: str) -> None:
@@ -329,7 +329,7 @@ def methods(scope: Scope) -> Iterator[Row]:
 
 
 def plausible_sets(scope: Scope) -> Iterator[Row]:
-    """The set of one step, of 34 million poses, on one thread and on two."""
+    """Yield the set of one step, of 34 million poses, on one thread and on two."""
     settings = plausible_settings("default", 0.001)
     truth = standing(drill(1.0)[0])
     for case in ("real_20", "real_150"):
@@ -345,4 +345,4 @@ MEASURES: dict[str, Callable[[Scope], Iterator[Row]]] = {
     "methods": methods,
     "plausible_sets": plausible_sets,
 }
-"""What is measured of this library alone."""
+"""Measurements of this library alone."""

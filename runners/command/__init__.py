@@ -1,1 +1,1 @@
-"""What all commands share: their arguments, choices and help, errors in one line, and scripts."""
+"""The parts that commands share: arguments, choices, help, errors in one line, and scripts."""

@@ -18,16 +18,16 @@ _FILES = {
     "rank": ("dir",),
     "report": ("dir",),
 }
-"""Of a command: the settings that words without a key are; the last takes all that are left."""
+"""Settings that words without a key are, by command; the last takes all that are left."""
 _OPEN_GROUPS = {"evaluate": ("settings", "outside", "policy"), "real": ("settings",)}
-"""Of a command: groups that may have any key, which Hydra wants to have ++ before it."""
+"""Groups that may have any key, by command; Hydra wants ++ before such a key."""
 _TAKES_VALUE = ("-c", "--cfg", "-p", "--package", "-cp", "-cn", "-cd", "-i", "--info")
 
 
 def hydra_arguments(command: str, words: Iterable[str]) -> list[str]:
-    """The arguments for Hydra of `python -m runners.COMMAND WORDS`, without `--traceback`.
+    """Return the arguments for Hydra of `python -m runners.COMMAND WORDS`, without `--traceback`.
 
-    Raises SettingError for a word without a key too many.
+    Raise SettingError for a word without a key too many.
     """
     words = [word for word in words if word != TRACEBACK]
     sweep = "-m" in words or "--multirun" in words
@@ -49,7 +49,7 @@ def hydra_arguments(command: str, words: Iterable[str]) -> list[str]:
 
 
 def as_typed(word: str, *, sweep: bool = False) -> str:
-    """KEY=VALUE with ~ for the home folder, and a value that Hydra cannot read in quotes.
+    """Return KEY=VALUE with ~ for the home folder, and a value that Hydra cannot read in quotes.
 
     A path such as a,b [1].obj is not of its grammar; of a sweep, values with commas are several.
     """
@@ -66,12 +66,12 @@ def as_typed(word: str, *, sweep: bool = False) -> str:
 
 
 def quoted(text: str) -> str:
-    """A text as a value that Hydra takes as it is."""
+    """Return a text as a value that Hydra takes as it is."""
     return QuotedString(text=text, quote=Quote.single).with_quotes()
 
 
 def _file_settings(names: tuple[str, ...], files: list[str]) -> Iterator[str]:
-    """Files as the settings that they are."""
+    """Yield files as the settings that they are."""
     if len(files) > len(names) and names[1:] != ("steps",):
         accepted = f"{names[0].upper()} KEY=VALUE ..."
         raise SettingError(f"{files[1]!r} is one argument too many; accepted: {accepted}")

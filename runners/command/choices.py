@@ -33,7 +33,7 @@ _OWN_GROUPS = ("presets", "rig", "faults")  # not options of the group around th
 
 
 def calls_for_anchored(session: str, policy: str) -> str:
-    """The choice, as typed, for which the default of method= is `default_method`; "" if none is."""
+    """Return the choice, as typed, that makes `default_method` the default of method=, or ""."""
     if policy != "grid":
         return f"policy={policy}"
     return f"session={session}" if session in ("points", "sensors") else ""
@@ -78,7 +78,7 @@ def store_choices() -> None:
 
 
 def _store_sessions() -> None:
-    """session/presets/rig/default has all keys of a rig, so that each can be changed by name."""
+    """Store sessions. session/presets/rig/default has all keys of a rig, to be changed by name."""
     for kind in ("simulated", "kinematic"):  # in PyBullet, and by geometry without an engine
         # configuration: a key of the top file, for short commands
         node = {"kind": kind, "configuration": "${configuration}"}
@@ -98,7 +98,7 @@ def _store_sessions() -> None:
 
 
 def _defaults(settings: type) -> dict[str, Any]:
-    """The defaults of the fields of a dataclass that have any."""
+    """Return the defaults of the fields of a dataclass that have any."""
     found = {}
     for field in fields(settings):
         make = field.default_factory
@@ -115,7 +115,7 @@ def _store_with_presets(
     node: dict[str, Any],
     *choices: dict[str, str],
 ) -> None:
-    """GROUP/NAME: its settings in the preset chosen, which are GROUP/presets/NAME/PRESET.
+    """Store GROUP/NAME: settings in the chosen preset, one of GROUP/presets/NAME/PRESET.
 
     choices: of groups below GROUP, with their usual option.
     """
@@ -133,12 +133,12 @@ def store(group: str, name: str, node: dict[str, Any], package: str | None = Non
 
 
 def _options(*groups: str) -> str:
-    """What the help texts in conf/ use: ${options:object,session} lists the options of groups."""
+    """Return the options of groups, for ${options:object,session} in the help texts of conf/."""
     return "\n".join(f"  {group}={'|'.join(_choices(group))}" for group in groups)
 
 
 def _choices(group: str) -> list[str]:
-    """The options of a group: files of conf/, and what is stored, also one folder below."""
+    """Return the options of a group: files of conf/, and what is stored, also one folder below."""
     stored = ConfigStore.instance().repo
     for part in group.split("/"):
         stored = stored.get(part, {})

@@ -84,7 +84,7 @@ class _Job:
 
 
 def _help(config_name: str, words: list[str]) -> str:
-    """The help of a command, with the settings among its words.
+    """Return the help of a command, with the settings among its words.
 
     Hydra's own would list all options of all groups, those of presets included, for 20 seconds.
     """
@@ -98,13 +98,13 @@ def _help(config_name: str, words: list[str]) -> str:
 
 
 def _importable(main: Callable[[DictConfig], None]) -> str:
-    """The name of the module of `main`, by which another process imports it as well."""
+    """Return the name of the module of `main`, by which another process imports it as well."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     return spec.name if main.__module__ == "__main__" and spec else main.__module__
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """The resolved configuration as plain dictionaries, lists and scalars."""
+    """Return the resolved configuration as plain dictionaries, lists and scalars."""
     container = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(container, dict)
     return {str(key): value for key, value in container.items()}
@@ -141,7 +141,7 @@ def _exit_on_error(run: Callable[[], None], config_name: str, show_traceback: bo
 
 
 def error_message(error: BaseException, config_name: str) -> str:
-    """One line: what was wrong, and what is accepted."""
+    """Return one line: what was wrong, and what is accepted."""
     cause = error.__cause__ if isinstance(error, HydraException) else None
     if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:
         group, _, choice = error.missing_cfg_file.rpartition("/")
@@ -165,7 +165,7 @@ def error_message(error: BaseException, config_name: str) -> str:
 
 
 def _unknown_key(error: ConfigKeyError | ConfigAttributeError, config_name: str) -> str:
-    """Where the path of an override leaves the configuration, and what stands there."""
+    """Return where the path of an override leaves the configuration, and which keys are there."""
     key = str(error.full_key).replace("[", ".").replace("]", "")
     where, _, name = key.rpartition(".")
     if any(part.isdecimal() for part in where.split(".")):  # an entry of a list lacks defaults
@@ -177,7 +177,7 @@ def _unknown_key(error: ConfigKeyError | ConfigAttributeError, config_name: str)
 
 
 def _mesh_as_object(missing: str) -> str:
-    """The file that was given as the option of `object`, if it is the name of one; else ""."""
+    """Return the file that was given as the option of `object`, if it is one; else ""."""
     group, _, option = missing.partition("/")
     return option if group == "object" and Path(option).suffix else ""
 

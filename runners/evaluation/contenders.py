@@ -35,23 +35,23 @@ class Contender:
     draw: int = 0  # of a method: which of several with other random numbers
 
     def method(self) -> Method:
-        """The method itself."""
+        """Return the method itself."""
         return build_method(self.name, self.settings)
 
     def policy(self) -> Policy:
-        """The policy itself."""
+        """Return the policy itself."""
         return build_policy(self.name, self.settings)
 
 
 def chosen_contenders(
     methods: Any, settings: Mapping[str, Any], preset: str, draws: int = 1
 ) -> dict[str, Contender]:
-    """By label, the contenders of a configuration's list, or of "all", each so many times.
+    """Return, by label, the contenders of a list, or of "all", each so many times.
 
     An entry is a label as `replay compare` takes it, NAME, NAME@PRESET or NAME@PRESET#MARK, or a
     mapping with name and, where wanted, label, preset and settings. settings: changes by method or
     by label, for all entries that these fit; an entry's own come last. preset: where an entry has
-    none. Raises SettingError for what does not exist, and for a label that is taken.
+    none. Raise SettingError for what does not exist, and for a label that is taken.
     """
     require_instance("settings", settings, Mapping, "a group of settings by method")
     require_repeats(draws)
@@ -76,7 +76,7 @@ def chosen_contenders(
 
 
 def chosen_policies(policies: Any, settings: Mapping[str, Any]) -> dict[str, Contender]:
-    """The policies of a configuration's list, or of "all", by label; none for None.
+    """Return the policies of a configuration's list, or of "all", by label; none for None.
 
     settings: changes to those that every policy has by default; an entry's own come last. Raises
     SettingError for what does not exist, and for a label that is taken.
@@ -95,7 +95,7 @@ def chosen_policies(policies: Any, settings: Mapping[str, Any]) -> dict[str, Con
 
 
 def _entries(setting: str, value: Any, every: Iterable[str], accepted: str) -> dict[str, Contender]:
-    """The entries of a list of contenders by their labels."""
+    """Return the entries of a list of contenders by their labels."""
     if isinstance(value, str):
         value = list(every) if value == "all" else [text.strip() for text in value.split(",")]
     listed = [value] if isinstance(value, Mapping) else value
@@ -132,12 +132,12 @@ def require_repeats(draws: int) -> None:
 
 
 def repeat_label(label: str, draw: int) -> str:
-    """What tables call a draw: the first one as if there were no others, then LABEL+1, LABEL+2."""
+    """Return the label of a draw in tables: LABEL for the first one, then LABEL+1, LABEL+2."""
     return f"{label}+{draw}" if draw else label
 
 
 def repeat_of(label: str, labels: Collection[str]) -> tuple[str, int]:
-    """The label without its draw, and the draw. labels: all that there are."""
+    """Return the label without its draw, and the draw. labels: all that there are."""
     match = _REPEAT.fullmatch(label)
     if match is None or match["label"] not in labels:
         return label, 0
@@ -145,5 +145,5 @@ def repeat_of(label: str, labels: Collection[str]) -> tuple[str, int]:
 
 
 def repeat_seed(seed: int, draw: int) -> int:
-    """The seed of all random streams of a draw, of a session with this seed."""
+    """Return the seed of all random streams of a draw, of a session with this seed."""
     return StreamKey(seed + _APART * draw, 0).seed

@@ -31,7 +31,7 @@ _TEXT, _COUNT, _NUMBER, _FLAG = pa.string(), pa.int64(), pa.float64(), pa.bool_(
 
 
 def _schema(*columns: tuple[pa.DataType, str]) -> pa.Schema:
-    """Columns by their type, names apart by spaces."""
+    """Return columns by their type; names are separated by spaces."""
     return pa.schema([(name, kind) for kind, names in columns for name in names.split()])
 
 
@@ -103,7 +103,7 @@ def write_part(path: Path, rows: Sequence[Row], schema: pa.Schema, source: str =
 
 
 def part_source(path: Path) -> str | None:
-    """What was kept with a part; None if there is no part."""
+    """Return the source that was kept with a part; None if there is no part."""
     if not path.exists():
         return None
     return (pa.parquet.read_schema(path).metadata or {}).get(b"about", b"").decode()
@@ -134,7 +134,7 @@ def collect(folder: Path) -> pa.Table:
 
 
 def gathered(folder: Path, experiment: Mapping[str, Any], name: str) -> pa.Table:
-    """The rows of one of TABLES, in order, of the parts that are finished."""
+    """Return the rows of one of TABLES, in order, of the parts that are finished."""
     schema = TABLES[name]
     suffixes = (".iterations.parquet",) if name == "iterations" else (".parquet", ".failed.parquet")
     labels = [*experiment["policies"]] or [*experiment["methods"], *experiment["outside"]]
@@ -156,7 +156,7 @@ def join_experiment(
 ) -> None:
     """Make the folder of an evaluation, or add configurations, seeds and methods to it.
 
-    Raises SettingError, naming what differs, if it was made with other settings, or is another's.
+    Raise SettingError, naming what differs, if it was made with other settings, or is another's.
     """
     path = plan.folder / FILE
     ours = _described(plan, name, configurations, seeds)
@@ -177,14 +177,14 @@ def join_experiment(
 
 
 def this_command() -> str:
-    """The command line of this program."""
+    """Return the command line of this program."""
     main = getattr(sys.modules.get("__main__"), "__spec__", None)
     program = ["python", "-m", main.name] if main else [Path(sys.argv[0]).name]
     return shlex.join([*program, *sys.argv[1:]])
 
 
 def read_experiment(folder: Path) -> dict[str, Any]:
-    """What experiment.json says. Raises RecordingError if it is damaged or missing."""
+    """Return experiment.json; raise RecordingError if it is damaged or missing."""
     path = folder / FILE
     try:
         return dict(json.loads(path.read_text()))
@@ -227,5 +227,5 @@ def _check_same(folder: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]
 
 
 def flat(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested values by their paths."""
+    """Return nested values by their paths."""
     return dict(pd.json_normalize(values).to_dict("records")[0])

@@ -1,4 +1,4 @@
-"""How hypotheses are measured: the definition of the plausible set, and the metrics beside it."""
+"""Metrics of hypotheses: by the plausible set and its definition, and those beside it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _COMBINED = {"sums": "sums over points (the paper's)", "means": "means over poin
 
 
 def definition_settings(definition: Mapping[str, Any], epsilon: float | None) -> PlausibleSettings:
-    """The settings of a choice `definition`, checked; epsilon, metres, where it has none."""
+    """Return the settings of a choice `definition`, checked; epsilon, metres, where it has none."""
     values = {key: value for key, value in definition.items() if key != "name"}
     if values.get("epsilon") is None:
         values["epsilon"] = epsilon
@@ -31,7 +31,7 @@ def definition_settings(definition: Mapping[str, Any], epsilon: float | None) ->
 
 
 def definition_label(definition: Mapping[str, Any]) -> str:
-    """The name of a definition as tables have it: two that differ never have the same one.
+    """Return the name of a definition as tables have it: two that differ never have the same one.
 
     Where settings were changed, the name of the one it was, "~", and the start of their digest.
     """
@@ -43,7 +43,7 @@ def definition_label(definition: Mapping[str, Any]) -> str:
 
 
 def definition_text(definition: Mapping[str, Any]) -> str:
-    """The label of a definition, and which poses are members by it."""
+    """Return the label of a definition, and which poses are members by it."""
     cost, epsilon = definition_settings(definition, 1.0).cost, definition.get("epsilon")
     bound = "that of each object" if epsilon is None else f"{1000.0 * epsilon:g} mm"
     return (
@@ -54,7 +54,7 @@ def definition_text(definition: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class MetricsConfig(DistanceSettings):
-    """How distances are measured, and for which hypotheses."""
+    """Settings of the metrics: how distances are measured, and for which hypotheses."""
 
     quantile: float = 1.0  # of the hypotheses by their cost, the cheapest
 
@@ -72,7 +72,7 @@ class HypothesisMetrics:
     def __init__(
         self, config: MetricsConfig, mesh: trimesh.Trimesh, world_from_object: FloatArray
     ) -> None:
-        """mesh: in metres. world_from_object (4, 4): the true pose."""
+        """Prepare the metrics. mesh: in metres. world_from_object (4, 4): the true pose."""
         self._config, self._mesh, self._truth = config, mesh, world_from_object
         self._distance: SurfaceDistance | None = None
 
@@ -84,7 +84,7 @@ class HypothesisMetrics:
         *,
         ranked: bool = True,
     ) -> dict[str, float]:
-        """Coverage, plausibility and diversity in mm^2, its root, and if wanted the rank."""
+        """Return coverage, plausibility and diversity in mm^2, its root, and if wanted the rank."""
         if found is None or len(found.cost) == 0:
             return {}
         distance = self._surface_distance(problem)
@@ -99,7 +99,7 @@ class HypothesisMetrics:
     def nearest(
         self, problem: RegistrationProblem, found: Hypotheses, truth: FloatArray
     ) -> tuple[int, float]:
-        """Index of the hypothesis nearest to the truth (4, 4), RMS distance of their surfaces, m.
+        """Return the index of the hypothesis nearest to the truth (4, 4), and its RMS distance, m.
 
         The truth is that of the problem's step, as pushes may move the object.
         """

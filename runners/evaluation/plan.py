@@ -1,4 +1,4 @@
-"""What an evaluation computes, as every worker knows it, and where its files are."""
+"""The plan of an evaluation, as every worker knows it, and the places of its files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ OBJECTS = {"models": "", "scans": "ycb/"}  # before the names of objects, by wha
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """All that determines the results, and where they go."""
+    """The settings of an evaluation that determine the results, and the folder of these."""
 
     folder: Path
     preset: str
@@ -69,21 +69,21 @@ class Plan:
 
     @property
     def kind(self) -> str:
-        """Of the sessions."""
+        """Kind of the sessions."""
         return str(self.session.get("kind"))
 
     @cached_property
     def configurations(self) -> dict[str, TrialConfiguration]:
-        """All that there are, by name."""
+        """Configurations of this kind by name, also those not chosen."""
         return configurations_of(self.kind, self.logs)
 
     @property
     def labels(self) -> list[str]:
-        """What a trial has a part of the table of: policies, or methods and external results."""
+        """Labels of the parts of a trial's table: policies, or methods and external results."""
         return [*self.policies] or [*self.contenders, *self.outside]
 
     def about(self, trial: Trial, label: str) -> dict[str, Any]:
-        """What all rows of a label in a trial share."""
+        """Return the columns that all rows of a label in a trial share."""
         row = {
             "object": self.configurations[trial.configuration].object,
             "configuration": trial.configuration,
@@ -98,13 +98,13 @@ class Plan:
         return row | {"method": label, "preset": preset, "definition": definition}
 
     def leader(self) -> Method | None:
-        """The method whose problems all methods get, if these are not their own."""
+        """Return the method whose problems all methods get, if these are not their own."""
         if self.starts == OWN:
             return None
         return build_method(self.starts, preset_settings(self.starts, self.preset))
 
     def object_config(self, configuration: str) -> ObjectConfig:
-        """The object of a configuration; at its real size in sessions of sensors."""
+        """Return the object of a configuration; at its real size in sessions of sensors."""
         of = self.configurations[configuration]
         if of.log_folder is not None:
             return recorded_object(of)
@@ -114,7 +114,7 @@ class Plan:
         return build_settings(ObjectConfig, values, "object")
 
     def session_config(self, trial: Trial) -> dict[str, Any]:
-        """The settings of the session of a trial, with its kind."""
+        """Return the settings of the session of a trial, with its kind."""
         if self.kind == SENSORS:
             # A pose beside the log is a guess here, from which the true pose is sought.
             return {**self.session, "path": str(trial.log(self)), "pose": "none"}
@@ -123,25 +123,25 @@ class Plan:
         return values if of.faults == CLEAN else values | {"faults": asdict(LEVELS[of.faults])}
 
     def session_settings(self, trial: Trial) -> Any:
-        """The same, checked."""
+        """Return the session settings of a trial, validated."""
         values = self.session_config(trial)
         return session_settings(values.pop("kind"), values)
 
     def faults(self, trial: Trial) -> str:
-        """The name of the level of faults in a trial's session."""
+        """Return the name of the level of faults in a trial's session."""
         return level_name(getattr(self.session_settings(trial), "faults", LEVELS[CLEAN]))
 
     def plausible_settings(self, epsilon: float) -> PlausibleSettings:
-        """The definition of the plausible sets of an object of this epsilon, metres."""
+        """Return the definition of the plausible sets of an object of this epsilon, metres."""
         return definition_settings(self.definition, epsilon)
 
     def probes_of(self, configuration: str) -> range:
-        """The indices that probes of a configuration may have."""
+        """Return the indices that probes of a configuration may have."""
         probes = self.configurations[configuration].probes
         return range(MOST_PROBES if probes is None else probes)
 
     def steps_of(self, configuration: str) -> tuple[int, ...]:
-        """The steps at which there may be a registration: those named that a configuration has."""
+        """Return the steps that may have a registration: those named that a configuration has."""
         every = self.probes_of(configuration)
         if self.steps is None:
             return tuple(every)
@@ -157,15 +157,15 @@ class Trial:
     configuration: str
 
     def folder(self, plan: Plan) -> Path:
-        """Where all about it is."""
+        """Return the folder of all files about it."""
         return plan.folder / "trials" / self.configuration / f"seed_{self.seed}"
 
     def without_faults(self, plan: Plan) -> Trial:
-        """The trial of the same probes whose plausible sets are those of this one, too."""
+        """Return the trial of the same probes that has its plausible sets."""
         return Trial(self.seed, plan.configurations[self.configuration].clean_name)
 
     def log(self, plan: Plan) -> Path:
-        """Its raw log, in sessions of sensors: a rosbag2 folder, or else an .mcap file."""
+        """Return its raw log, in sessions of sensors: a rosbag2 folder, or else an .mcap file."""
         folder = (plan.logs or plan.folder / "logs") / self.configuration
         bag = folder / f"seed_{self.seed}"
         return bag if bag.is_dir() else folder / f"seed_{self.seed}.mcap"
@@ -173,7 +173,7 @@ class Trial:
 
 @dataclass(frozen=True, order=True)
 class Task:
-    """What one worker does at a time: the session of a trial, or a label's rows about it."""
+    """The work of one worker at a time: the session of a trial, or a label's rows about it."""
 
     trial: Trial
     label: str = ""  # of a contender or external results; "" for session and plausible sets
@@ -183,17 +183,17 @@ class Task:
         return f"{self.trial.configuration}, seed {self.trial.seed}: {what}"
 
     def sessions(self, plan: Plan) -> tuple[Trial, ...]:
-        """The trials whose sessions are needed, with faults that without, too; of policies none."""
+        """Return the trials whose sessions are needed, also without faults; none of policies."""
         if plan.policies:
             return ()
         clean = self.trial.without_faults(plan) if plan.plausible else self.trial
         return tuple(dict.fromkeys([clean, self.trial]))
 
     def finished(self, plan: Plan) -> Path:
-        """The file that is there once the task is finished."""
+        """Return the file that exists once the task is finished."""
         folder = self.trial.folder(plan)
         return folder / (f"{self.label}.parquet" if self.label else "session.json")
 
     def failed(self, plan: Plan) -> Path:
-        """Rows that say how the task failed, until it is done again."""
+        """Return the file of the rows that say how the task failed, until it succeeds."""
         return self.trial.folder(plan) / f"{self.label}.failed.parquet"

@@ -30,7 +30,7 @@ _DASK = {
 
 @contextmanager
 def connected(scheduler: str | None, workers: int | None) -> Iterator[tuple[Client, int]]:
-    """A client of a Dask cluster, and how many workers it has.
+    """Open a client of a Dask cluster, with the number of its workers.
 
     scheduler: the address of one that runs; None for workers of our own, processes of one thread
     on this machine, that end with the context: so many, or one a core; "slurm" for so many jobs of
@@ -75,7 +75,7 @@ def connected(scheduler: str | None, workers: int | None) -> Iterator[tuple[Clie
 
 
 def _jobs(count: int) -> Any:
-    """A cluster of SLURM with so many jobs; another one starts in place of one that is lost."""
+    """Return a cluster of SLURM with so many jobs; a lost one is replaced."""
     import dask
 
     try:
@@ -95,7 +95,7 @@ def _jobs(count: int) -> Any:
 
 
 def checked_size(client: Client) -> int:
-    """How many workers a running cluster has. Raises SettingError if one has several threads."""
+    """Return the number of workers; raise SettingError if one has several threads."""
     of_workers = client.nthreads().values()
     if max(of_workers, default=1) > 1:
         raise SettingError(
@@ -106,14 +106,14 @@ def checked_size(client: Client) -> int:
 
 
 def tasks_of(plan: Plan, trials: Sequence[Trial]) -> list[Task]:
-    """All tasks of trials, seed by seed, those without a label, which others need, first."""
+    """Return all tasks of trials, seed by seed, those without a label, which others need, first."""
     labelled = [Task(trial, label) for trial in trials for label in plan.labels]
     sessions = {Task(session) for task in labelled for session in task.sessions(plan)}
     return sorted(sessions) + sorted(labelled)
 
 
 def is_finished(plan: Plan, task: Task) -> bool:
-    """Whether the task's last file is there; external results may have changed since."""
+    """Return whether the task's last file is there; external results may have changed since."""
     if task.label in plan.outside:
         digest = external_digest(plan, task.trial, task.label)
         return part_source(task.finished(plan)) == digest
@@ -169,7 +169,7 @@ def do_tasks(
 
 
 def _failure(future: Future) -> str:
-    """Why a task has no result. Raises ChselError if that says nothing about the task."""
+    """Return why a task has no result; raise ChselError if that says nothing about the task."""
     from distributed import KilledWorker
 
     if future.cancelled():
@@ -184,8 +184,8 @@ def _note(plan: Plan, task: Task, failure: str) -> str:
     """Make a failure a part of the table: a row a step, or one if there is no session's steps."""
     if failure and task.label:
         row = {**plan.about(task.trial, task.label), "status": f"failed: {failure}"}
-        told = task.trial.folder(plan) / "session.json"
-        steps = read_told(told.parent)["steps"] if told.exists() and not plan.policies else [None]
+        notes = task.trial.folder(plan) / "session.json"
+        steps = read_told(notes.parent)["steps"] if notes.exists() and not plan.policies else [None]
         rows = [{**row, "step": step} for step in steps]
         write_part(task.failed(plan), rows, PROBES if plan.policies else RESULTS)
     return failure

@@ -42,10 +42,10 @@ class TrialConfiguration:
 
 
 def configurations_of(kind: str, logs: Path | None = None) -> dict[str, TrialConfiguration]:
-    """All configurations of a kind of session, by name; of simulated ones with levels of faults.
+    """Return all configurations of a kind of session, by name, with levels of faults if simulated.
 
     Those of sessions of sensors are the folders in `logs`, and the simulated robot's where there
-    are no others. Raises SettingError for a folder that does not exist or does not name its object.
+    are no others. Raise SettingError for a folder that does not exist or does not name its object.
     """
     known = CABINET_CONFIGURATIONS if kind == SENSORS else CONFIGURATIONS
     simulated = {
@@ -71,18 +71,18 @@ def configurations_of(kind: str, logs: Path | None = None) -> dict[str, TrialCon
 
 
 def faulty_name(configuration: str, level: str) -> str:
-    """The name of a configuration with a level of faults."""
+    """Return the name of a configuration with a level of faults."""
     return configuration if level == CLEAN else f"{configuration}+{level}"
 
 
 def object_values(name: str) -> dict[str, Any]:
-    """What the choice object=NAME says."""
+    """Return the values of the choice object=NAME."""
     require_choice("object", name, sorted(OBJECTS))
     return settings_mapping(OBJECTS[name])
 
 
 def recorded_object(configuration: TrialConfiguration) -> ObjectConfig:
-    """The object of a folder of logs, at its real size unless its file gives another scale.
+    """Return the object of a folder of logs, at its real size unless its file gives another scale.
 
     `name`, of a model or of a scan, or with other keys; a `path` is relative to the folder.
     """
@@ -116,7 +116,7 @@ def _object_file(path: Path) -> Mapping[str, Any]:
 def chosen_names(
     setting: str, value: Any, existing: Iterable[str], objects: Mapping[str, str] | None = None
 ) -> tuple[str, ...]:
-    """Which of the existing names a setting has, in the order of all of them.
+    """Return the existing names that a setting chooses, in the order of all of them.
 
     A name, an object, a pattern such as noise_*, "all", or a list of these. objects: by name.
     """
@@ -136,7 +136,7 @@ def chosen_names(
 
 
 def chosen_seeds(value: Any) -> tuple[int, ...]:
-    """The seeds that a value names, ascending: 3, [0, 1], "0..9" or a list of these."""
+    """Return the seeds that a value names, ascending: 3, [0, 1], "0..9" or a list of these."""
     chosen: set[int] = set()
     for part in _listed("seeds", value):
         match = _SEEDS.fullmatch(str(part))
@@ -150,7 +150,7 @@ def chosen_seeds(value: Any) -> tuple[int, ...]:
 
 
 def _listed(name: str, value: Any) -> list[Any]:
-    """The parts of a setting: those of a list, and of texts what is between commas."""
+    """Return the parts of a setting: those of a list, and of texts what is between commas."""
     parts = value if isinstance(value, list | tuple) else [value]
     listed = [
         one

@@ -44,7 +44,7 @@ _ONE = OnlineSettings(hypotheses=1)  # E_0 of one pose, which stands for any
 
 
 class StepRecorder(Recorder):
-    """Hands the events of a step to another recorder, if there is one, when the step ends."""
+    """A recorder that passes the events of a step on, if there is another, when the step ends."""
 
     def __init__(self, recorder: Recorder | None) -> None:
         self.step = 0  # of the last probe
@@ -70,7 +70,7 @@ class StepRecorder(Recorder):
 
 @contextmanager
 def recording_in(path: Path | None) -> Iterator[StepRecorder]:
-    """A recorder of a session that ends with the context, into a file that is whole, or none."""
+    """Open the recorder of a session, into a file that is whole at the end, or does not exist."""
     if path is None:
         yield StepRecorder(None)
         return
@@ -87,7 +87,7 @@ def recording_in(path: Path | None) -> Iterator[StepRecorder]:
 
 
 def probe_config(plan: Plan, trial: Trial, policy: Contender | None = None) -> ProbeConfig:
-    """What `runners.probe` would be asked for, with the first method, to probe as in a trial."""
+    """Return the configuration of `runners.probe` for the probes of a trial."""
     first = next(iter(plan.contenders.values()), None)
     return ProbeConfig(
         object=plan.object_config(trial.configuration),
@@ -106,7 +106,7 @@ def probe_config(plan: Plan, trial: Trial, policy: Contender | None = None) -> P
 
 
 def config_values(config: ProbeConfig) -> dict[str, Any]:
-    """The same as `session_started` takes it."""
+    """Return the configuration as `session_started` takes it."""
     return {name: vars(v) if is_dataclass(v) else v for name, v in vars(config).items()}
 
 
@@ -154,27 +154,27 @@ def make_session(plan: Plan, trial: Trial) -> None:
                 made_set(folder / "plausible", problem, truth, settings)
             except EvaluationError as error:
                 failures[str(problem.key.step)] = " ".join(str(error).split())
-    told: dict[str, Any] = {"steps": steps, "no_plausible_set": failures}
+    notes: dict[str, Any] = {"steps": steps, "no_plausible_set": failures}
     if TRUTH in session.recorded.config:
-        told[TRUTH] = session.recorded.config[TRUTH]
+        notes[TRUTH] = session.recorded.config[TRUTH]
     with whole_file(folder / "session.json") as beside:
-        beside.write_text(json.dumps(told, indent=2) + "\n")
+        beside.write_text(json.dumps(notes, indent=2) + "\n")
 
 
 def read_told(folder: Path) -> dict[str, Any]:
-    """What `make_session` wrote down: steps with a registration, and why some have no set."""
+    """Return what `make_session` wrote: steps with a registration, and why some have no set."""
     return dict(json.loads((folder / "session.json").read_text()))
 
 
 def open_recorded(plan: Plan, trial: Trial) -> RecordedSession:
-    """The session of a trial, from its recording."""
+    """Return the session of a trial, from its recording."""
     path, settings = trial.folder(plan) / "session.mcap", plan.session_settings(trial)
     start = settings.start_contacts, settings.start_probe
     return RecordedSession(RecordedSettings(str(path), *start))
 
 
 def plausible_settings_of(plan: Plan, session: RecordedSession) -> PlausibleSettings:
-    """The definition of the plausible sets of a session."""
+    """Return the definition of the plausible sets of a session."""
     config = session.recorded.config["object"]
     return plan.plausible_settings(float(config["epsilon"]))
 
@@ -193,7 +193,7 @@ def made_set(
     truth: FloatArray,
     settings: PlausibleSettings,
 ) -> tuple[PlausibleSet, bool]:
-    """The set of a step, and whether it was there."""
+    """Return the set of a step, and whether it was there."""
     found = sets.load_plausible(folder, problem, settings, world_from_object=truth)
     if found is not None:
         return found, True

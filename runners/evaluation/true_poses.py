@@ -58,11 +58,11 @@ class SourceConfig(CheckedSettings):
         return Path(self.file or "").expanduser()
 
     def folder(self, usual: Path) -> Path:
-        """Where to write."""
+        """Return the folder to write to."""
         return Path(self.out).expanduser() if self.out else usual
 
     def open(self) -> Source:
-        """What the file holds. Raises SettingError for settings that it makes useless."""
+        """Return the session of the file; raise SettingError for settings that it makes useless."""
         if is_recording(self.path):
             accepted = "a raw log or known points with it"
             reason = f"the recording {self.path} brings its own object and points"
@@ -77,11 +77,11 @@ def sought_pose(
     settings: TruePoseSettings,
     truth: FloatArray | None = None,
 ) -> tuple[FloatArray, dict[str, Any]]:
-    """The pose of least evaluation cost near a guess, both world_from_object (4, 4), and numbers.
+    """Return the pose of least evaluation cost near a guess, and numbers about it.
 
     problem: of a session's last step. mesh: of the object, m. truth: (4, 4), where it is known. The
     numbers are plain values: metres and radians, modulo the object's symmetries, at its centre.
-    Raises SessionError if there is no contact.
+    Raise SessionError if there is no contact.
     """
     if len(problem.points.known) == 0:
         raise SessionError("there is no contact; accepted: a session that touched the object")
@@ -107,14 +107,14 @@ def sought_pose(
 def fit(
     problem: RegistrationProblem, world_from_object: FloatArray, settings: TruePoseSettings
 ) -> dict[str, Any]:
-    """How well a pose (4, 4) fits what is known.
+    """Return how well a pose (4, 4) fits the known points.
 
     Mean and greatest distance in metres of known points from where their SDF has their values, and
     how many free points are deeper inside than the tolerance of the evaluation cost.
     """
 
     def distances(points: FloatArray) -> FloatArray:
-        """Signed distances (N,) of points (N, 3) in the world, between the nodes of the grid."""
+        """Return signed distances (N,) of points (N, 3), world, between the nodes of the grid."""
         return problem.sdf.at(apply(inverse(world_from_object), points), lookup="trilinear")[0]
 
     points = problem.points
@@ -128,7 +128,7 @@ def fit(
 
 
 def pose_beside(path: Path) -> FloatArray:
-    """world_from_object (4, 4) of the pose file beside a log, a recording or a file of points."""
+    """Return world_from_object (4, 4) of the pose file beside a log, a recording or points."""
     if not beside(path).exists():
         raise SettingError(
             f"{path} has no true pose, and there is no {beside(path).name} beside it; accepted: a "
@@ -149,7 +149,7 @@ def check_log(plan: Plan, trial: Trial) -> None:
 
 
 def ensure_log(plan: Plan, trial: Trial) -> Path:
-    """The log of a trial; it is simulated if it is missing and a simulated robot's."""
+    """Return the log of a trial; it is simulated if it is missing and a simulated robot's."""
     log = trial.log(plan)
     if not is_missing(plan, trial):
         return log
@@ -166,26 +166,26 @@ def ensure_log(plan: Plan, trial: Trial) -> Path:
 
 
 def is_missing(plan: Plan, trial: Trial) -> bool:
-    """Whether a trial's log, or what tells about its object's pose, is still to be simulated."""
+    """Return whether a trial's log, or the file of its object's pose, is still to be simulated."""
     log = trial.log(plan)
     there = log.exists() and (beside(log).exists() or _truth_path(log).exists())
     return plan.configurations[trial.configuration].log_folder is None and not there
 
 
 def guessed_pose(log: Path) -> FloatArray:
-    """world_from_object (4, 4) about where a log's object is: beside it, or its truth roughly."""
+    """Return a rough world_from_object (4, 4): beside the log, or its simulated truth rounded."""
     truth = None if beside(log).exists() else simulated_truth(log)
     return pose_beside(log) if truth is None else as_set_by_hand(truth)
 
 
 def simulated_truth(log: Path) -> FloatArray | None:
-    """world_from_object (4, 4) of a simulated log, to which results are compared; else None."""
+    """Return world_from_object (4, 4) of a simulated log, for comparison; else None."""
     path = _truth_path(log)
     return read_pose(path) if path.exists() else None
 
 
 def as_set_by_hand(world_from_object: FloatArray) -> FloatArray:
-    """A pose (4, 4) to whole centimetres, and to whole 10 degrees of roll, pitch and yaw."""
+    """Return a pose (4, 4) to whole centimetres, and to whole 10 degrees of roll, pitch and yaw."""
     position = np.rint(world_from_object[:3, 3] / _POSITION_STEP) * _POSITION_STEP
     angles = Rotation.from_matrix(world_from_object[:3, :3]).as_euler("xyz")
     return compose(roll_pitch_yaw(np.rint(angles / _ANGLE_STEP) * _ANGLE_STEP), position)

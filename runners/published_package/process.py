@@ -31,7 +31,7 @@ class PackageError(ChselError):
 
 @dataclass(frozen=True)
 class PackageConfig:
-    """Where the published package is."""
+    """The place of the published package."""
 
     python: str | None = None  # an interpreter that has the package
     directory: str = "~/.cache/chsel/published"  # else, where its environment is, or is made
@@ -42,7 +42,7 @@ store("package", "default", settings_mapping(PackageConfig()))
 
 
 def interpreter(config: PackageConfig, say: Callable[[str], None]) -> Path:
-    """The interpreter that has the package; its environment is made first if there is none.
+    """Return the interpreter that has the package; its environment is made first if there is none.
 
     The environment has torch in the version and build of ours.
     """
@@ -74,7 +74,7 @@ def _run(what: str, command: list[str]) -> None:
 
 
 def last_line(text: str) -> str:
-    """What an error output says, in one line."""
+    """Return the last line of an error output."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     errors = [line for line in lines if line.startswith("ERROR:")]
     return (errors or lines or ["no message"])[-1]
@@ -92,7 +92,7 @@ class PublishedPackage:
     """A process that registers with the package, one request at a time."""
 
     def __init__(self, python: Path) -> None:
-        """Raises PackageError if `python` is not an interpreter that has the package."""
+        """Use an interpreter; raise PackageError if it does not have the package."""
         self._warm = False
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
         self._printed = tempfile.TemporaryFile()  # noqa: SIM115  (closed by close)
@@ -141,7 +141,7 @@ class PublishedPackage:
             self.ask("load", problem=str(path))
 
     def register(self, **arguments: Any) -> dict[str, Any]:
-        """What the worker's `register` gives; the first runs twice, as it loads what is needed."""
+        """Return the answer of the worker's `register`; the first runs twice, to load all code."""
         if not self._warm:
             self.ask("register", **arguments)
             self._warm = True

@@ -26,7 +26,7 @@ _COSTS = {"default": "VolumetricDirectSDFCost", "equation": "VolumetricDoubleDir
 
 
 class GridSdf:
-    """Stands where the package has the mesh: answers every query by the nearest node of our grid.
+    """A stand-in for the package's mesh, which answers queries by the nearest node of our grid.
 
     So both packages read the same signed distances, and the query of the whole mesh that the
     package's constructor makes costs it next to nothing.
@@ -40,14 +40,14 @@ class GridSdf:
         self._bounds = torch.tensor(data["object_bounds"], dtype=torch.float32).T  # (3, 2)
 
     def __call__(self, points: Any, compute_grad: bool = True) -> tuple[Any, Any]:
-        """Values (...) and gradients (..., 3) at points (..., 3)."""
+        """Return values (...) and gradients (..., 3) at points (..., 3)."""
         index = ((points.double() - self._origin) / self._resolution).round().long()
         last = torch.tensor(self._values.shape) - 1
         i, j, k = torch.minimum(index.clamp_min(0), last).unbind(-1)
         return self._values[i, j, k], self._gradients[i, j, k]
 
     def surface_bounding_box(self, padding: float = 0.0, padding_ratio: float = 0.0) -> Any:
-        """Lowest and highest coordinates (3, 2) of the mesh."""
+        """Return lowest and highest coordinates (3, 2) of the mesh."""
         margin = padding + padding_ratio * (self._bounds[:, 1] - self._bounds[:, 0])
         return self._bounds + torch.stack([-margin, margin], dim=-1)
 
@@ -63,7 +63,7 @@ class Worker:
         self._folder = tempfile.mkdtemp()
 
     def describe(self) -> dict[str, Any]:
-        """Versions of what runs here."""
+        """Return the versions of the packages here."""
         versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
         return {"python": platform.python_version(), **versions}
 
@@ -94,7 +94,7 @@ class Worker:
     def register(
         self, seed: int, cost: str = "", restarts: int = 0, steps: int = 0, search: int = 0
     ) -> dict[str, Any]:
-        """Construct and register once, with the package's own settings where none are given.
+        """Return construct and register once, with the package's own settings where none are given.
 
         Gives seconds, those of the processor alone, poses (B, 4, 4) of object_from_world with
         their cost (B,), the poses (L, 4, 4) of the archive's elites, E_l of the next registration,
@@ -148,7 +148,7 @@ class Worker:
 
 
 def _counting(cost: Any) -> Any:
-    """The cost class, counting how often it is called for its gradient."""
+    """Return the cost class, counting how often it is called for its gradient."""
 
     class Counting(cost):
         gradients = 0
@@ -161,7 +161,7 @@ def _counting(cost: Any) -> Any:
 
 
 def _matrices(rotation: Any, position: Any) -> list[Any]:
-    """Transforms (B, 4, 4) as nested lists."""
+    """Return transforms (B, 4, 4) as nested lists."""
     transforms = torch.eye(4, dtype=torch.float64).repeat(len(rotation), 1, 1)
     transforms[:, :3, :3], transforms[:, :3, 3] = rotation, position
     return transforms.tolist()

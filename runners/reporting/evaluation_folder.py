@@ -51,12 +51,12 @@ class Evaluation:
 
 
 def trials_of(rows: pd.DataFrame) -> set[Trial]:
-    """The trials that have rows."""
+    """Return the trials that have rows."""
     return set(rows[TRIAL].itertuples(index=False, name=None))
 
 
 def last_half(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows of the latter half of every trial's steps, which are those of all methods."""
+    """Return the rows of the latter half of every trial's steps, which are those of all methods."""
     with_step = rows[rows["step"].notna()]
     first = with_step.groupby(TRIAL)["step"].transform(
         lambda steps: sorted(steps.unique())[steps.nunique() // 2]
@@ -73,7 +73,7 @@ def open_evaluation(folder: Path) -> Evaluation:
 
 
 def _table(folder: Path, experiment: Mapping[str, Any], name: str) -> pd.DataFrame:
-    """The rows of a table; none of a kind that the evaluation does not have."""
+    """Return the rows of a table; none of a kind that the evaluation does not have."""
     path, table = folder / f"{name}.parquet", TABLES[name].empty_table()
     if bool(experiment["policies"]) == (name == "probes"):
         there = path.exists()
@@ -91,7 +91,7 @@ def _table(folder: Path, experiment: Mapping[str, Any], name: str) -> pd.DataFra
 
 
 def _with_draws(rows: pd.DataFrame, experiment: Mapping[str, Any]) -> pd.DataFrame:
-    """The rows with the label of their method and their draw apart."""
+    """Return the rows with the label of their method and their draw apart."""
     labels = {*rows["method"], *experiment["methods"], *experiment["outside"]}
     apart = rows["method"].map(lambda label: repeat_of(label, labels))
     return rows.assign(method=apart.str[0], draw=apart.str[1])

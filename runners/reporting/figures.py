@@ -47,16 +47,16 @@ _RC: Any = {
 
 @dataclass(frozen=True)
 class Style:
-    """How a method or policy looks. color: "#rrggbb". marker, line: as matplotlib calls them."""
+    """The looks of a method or policy."""
 
     title: str
-    color: str
-    marker: str
-    line: str
+    color: str  # "#rrggbb"
+    marker: str  # as matplotlib names it
+    line: str  # likewise
 
     @property
     def looks(self) -> dict[str, Any]:
-        """Of a line, as matplotlib takes them."""
+        """Arguments of matplotlib for a line."""
         return {"color": self.color, "marker": self.marker, "linestyle": self.line}
 
 
@@ -88,7 +88,7 @@ _OTHER_MARKERS = ("h", "d", ">", "8", "*", "H")
 
 
 def styles_of(names: Collection[str]) -> dict[str, Style]:
-    """The looks of methods or policies in the order of all figures: ours, then by name."""
+    """Return the looks of methods or policies in the order of all figures: ours, then by name."""
     styles = {name: style for name, style in _KNOWN.items() if name in names}
     for index, name in enumerate(sorted(set(names) - set(_KNOWN))):
         color = _OTHERS[index % len(_OTHERS)]
@@ -117,7 +117,7 @@ def drawing() -> Iterator[None]:
 
 
 def new_figure(height: float) -> Figure:
-    """A figure of the page's width and a height in inches."""
+    """Return a figure of the page's width and a height in inches."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
@@ -126,7 +126,7 @@ def new_figure(height: float) -> Figure:
 def curves(
     name: str, data: pd.DataFrame, styles: Styles, across: str, up: str | Mapping[str, str]
 ) -> Picture | None:
-    """A panel for each value of the first column, with a line and a band for each of the second.
+    """Return a panel a value of the first column, with a line and a band for each of the second.
 
     The third column is x; the last three are the band's lower edge, the line and the upper edge.
     across: label of x. up: of y in all panels, which then have titles, or in each. None of no row.
@@ -159,7 +159,7 @@ def curves(
 
 
 def boxes(name: str, data: pd.DataFrame, styles: Styles, label: str) -> Picture | None:
-    """A panel for each value of the first column, with a box of the last for each of the second.
+    """Return a panel a value of the first column, with a box of the last for each of the second.
 
     label: of the numbers in the last column. None without a row.
     """
@@ -189,7 +189,7 @@ def boxes(name: str, data: pd.DataFrame, styles: Styles, label: str) -> Picture 
 
 
 def _panels(data: pd.DataFrame) -> tuple[Figure, list[tuple[Axes, str, pd.DataFrame, bool]]]:
-    """A panel a value of the first column: axes, value, rows, and whether no panel is below."""
+    """Return a panel a value of the first column: axes, value, rows, whether it is the lowest."""
     column = data.columns[0]
     names = list(dict.fromkeys(data[column]))
     across = min(3, len(names))
@@ -202,7 +202,7 @@ def _panels(data: pd.DataFrame) -> tuple[Figure, list[tuple[Axes, str, pd.DataFr
 
 
 def positive_scale(axes: Axes, values: pd.Series) -> None:
-    """A logarithmic y axis for these numbers; linear below the least above zero where zeros are."""
+    """Set a logarithmic y axis for these numbers, linear below the least above zero."""
     positive = values[values > 0.0]
     if positive.empty:
         return

@@ -39,7 +39,7 @@ class Section:
 def as_markdown(
     evaluation: Evaluation, sections: Sequence[Section], command: str, kind: str
 ) -> str:
-    """The report. command: that makes it again. kind: of its pictures' files, one of FORMATS."""
+    """Return the report. command: repeats it. kind: of its pictures' files, one of FORMATS."""
     name = _escaped(evaluation.experiment["name"])
     parts = [f"# Evaluation {name}", _escaped(_lead(evaluation))]
     for section in sections:
@@ -56,7 +56,7 @@ def as_markdown(
 
 
 def as_html(markdown: str, pictures: Mapping[str, bytes]) -> str:
-    """The same to be read without anything else. pictures: contents of files by their names."""
+    """Return the report as one HTML page. pictures: contents of files by their names."""
     body = MarkdownIt("commonmark", {"html": False}).enable("table").render(markdown)
     for name, content in pictures.items():
         kind = "image/svg+xml" if name.endswith("svg") else "image/png"
@@ -68,7 +68,7 @@ def as_html(markdown: str, pictures: Mapping[str, bytes]) -> str:
 
 
 def _lead(evaluation: Evaluation) -> str:
-    """What the report is about."""
+    """Return the first paragraph of the report."""
     done = evaluation.probes if evaluation.experiment["policies"] else evaluation.rows
     if done.empty:
         return "Nothing is finished yet: there is no registration to report on."
@@ -95,12 +95,12 @@ def _cell(text: str) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Text that Markdown takes for nothing else."""
+    """Return text that Markdown shows as it is."""
     return re.sub(r"([\\`*_<>|#]|(?<=\])\()", r"\\\1", " ".join(text.split()))
 
 
 def _made(experiment: Mapping[str, Any]) -> Iterator[Table]:
-    """Settings and versions."""
+    """Yield the tables of settings and versions."""
     settings = {name: value for name, value in experiment.items() if name not in _NOT_SHOWN}
     versions = {str(n): one for n, one in enumerate(experiment["environments"], 1)}
     for title, values in (("Settings", settings), ("Versions", versions)):

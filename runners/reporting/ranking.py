@@ -21,14 +21,14 @@ _TIMES = ["seconds", "decision_seconds"]
 
 
 def stored_names(kept: Path) -> list[str]:
-    """Names of the evaluations in a folder."""
+    """Return names of the evaluations in a folder."""
     return sorted(path.parent.name for path in kept.glob("*/experiment.json"))
 
 
 def ranking(folder: Path, kept: Path = KEPT) -> Iterator[str | Table]:
-    """Whether an evaluation has the bits of the kept one where both have rows, and its place.
+    """Yield whether an evaluation has the bits of the kept one at the same rows, and its place.
 
-    Raises RecordingError for a folder that is no evaluation, SettingError if none of its name and
+    Raise RecordingError for a folder that is no evaluation, SettingError if none of its name and
     kind is kept.
     """
     own = open_evaluation(folder)

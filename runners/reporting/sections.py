@@ -47,6 +47,9 @@ _PD = "PD in mm²"
 _RUN, BASELINE = "What was run", "All methods beside the baseline"
 _TRUTH_HELD = "Whether sets hold the truth"
 _FAULTS = "Faults, and whether sets hold the truth"
+_MEDIAL = "The Medial Constraint with and without quality diversity"
+_CVO = "CVO with and without free space"
+_OF_A_FEW = "Plausible diversity as in the sections on all methods, of these methods alone."
 _BUSY = "on one thread, after a warm-up. Several workers on one machine slow each other down."
 _LAST_HALF = (
     "Numbers are pooled over trials (a configuration with a seed) and over the steps of the last "
@@ -56,6 +59,7 @@ _TEXTS = {  # of sections, by title
     _RUN: "A trial is a configuration with a seed. What has failed is nowhere counted as a number.",
     "True poses": "The true pose of a recorded session is the one of least evaluation cost, after "
     "the last probe, near a pose that a person set (of a simulated log: its rounded truth).",
+    _TRUTH_HELD: "Of methods that say which poses they cannot tell from their best one.",
     _FAULTS: "Plausible sets are of the contacts without faults, "
     "see docs/faults.md. All other sections pool the levels. Distances are between surfaces.",
     BASELINE: "Over every step of every trial and draw. A ratio is PD by that of {baseline} at the "
@@ -65,6 +69,8 @@ _TEXTS = {  # of sections, by title
     "an object. Lower is better. First and last steps are of some trials only.",
     "Plausible diversity by object and method": f"{_LAST_HALF} Boxes span the quartiles, lines "
     "across are medians; whiskers reach to the last numbers within 1.5 boxes. Lower is better.",
+    _MEDIAL: _OF_A_FEW,
+    _CVO: _OF_A_FEW,
     "Time per registration": f"Wall-clock time of the registration alone {_BUSY}",
     "Plausible diversity and cost over QD iterations": "What a method would give if its search "
     "ended there, medians and quartiles over trials and steps, of which each has one start.",
@@ -89,11 +95,8 @@ _TEXTS = {  # of sections, by title
     f"registration before it, and of both together, {_BUSY}",
 }
 _FEW_METHODS = {  # name of the picture: title of the section, methods
-    "medial": (
-        "The Medial Constraint with and without quality diversity",
-        ("chsel", "medial_constraint", "medial_constraint_cma_me"),
-    ),
-    "cvo": ("CVO with and without free space", ("icp", "cvo", "cvo_no_free_space")),
+    "medial": (_MEDIAL, ("chsel", "medial_constraint", "medial_constraint_cma_me")),
+    "cvo": (_CVO, ("icp", "cvo", "cvo_no_free_space")),
 }
 _FAULTY_COLUMNS = {  # title and unit of the table, factor
     "nearest_hypothesis": ("From the true pose to the nearest hypothesis, mm", _MM),
@@ -120,16 +123,20 @@ Part = tuple[str, Sequence[Table], Picture | None]  # title, tables, picture of 
 
 
 def sections_of(evaluation: Evaluation, baseline: str | None = None) -> list[Section]:
-    """What there is something to show of, and what was run.
+    """Return the sections of a report: what was run, and those that have a table with rows.
 
-    Raises SettingError for a baseline without PD, or of policies without a session.
+    Raise SettingError for a baseline without PD, or of policies without a session.
     """
     on = _on_policies if evaluation.experiment["policies"] else _on_methods
     parts, numbers = on(evaluation, baseline)
-    return [
-        Section(title, _TEXTS.get(title, "").format(**numbers), tables, picture)
+    every = [
+        Section(title, _TEXTS[title].format(**numbers), tables, picture)
         for title, tables, picture in parts
-        if title == _RUN or any(table.rows for table in tables)
+    ]
+    return [
+        section
+        for section in every
+        if section.title == _RUN or any(table.rows for table in section.tables)
     ]
 
 
@@ -172,7 +179,7 @@ def _on_methods(
 
 
 def short_tables(evaluation: Evaluation) -> list[Table]:
-    """What is shown of an evaluation that has just ended."""
+    """Return the tables that are shown of an evaluation that has just ended."""
     rows = evaluation.rows
     if not evaluation.experiment["policies"]:
         styles = styles_of(evaluation.methods)
@@ -190,7 +197,7 @@ def short_tables(evaluation: Evaluation) -> list[Table]:
 def _what_was_run(
     evaluation: Evaluation, rows: pd.DataFrame, by: str, styles: Styles
 ) -> list[Table]:
-    """What there is of methods or policies, as `by` says: trials, and rows by status."""
+    """Return tables of methods or policies, as `by` says: trials, and rows by status."""
     planned, lines = {*evaluation.planned_trials}, []
     kinds = rows["status"].str.replace(r":.*", "", regex=True)
     for name, style in styles.items():
@@ -209,14 +216,14 @@ def _what_was_run(
 
 
 def true_pose_table(evaluation: Evaluation) -> Table:
-    """How well true poses of sensors' logs fit, and how far they are from guess and simulation."""
-    told, lines = [], []
+    """Return how well true poses of sensors' logs fit, and their distance to guess and truth."""
+    truths, lines = [], []
     for configuration, seed in evaluation.planned_trials:
         path = evaluation.folder / "trials" / configuration / f"seed_{seed}" / "session.json"
         if path.exists() and (truth := json.loads(path.read_text()).get("truth")):
-            told.append({**truth, "configuration": configuration})
-    found = pd.json_normalize(told)
-    groups = list(found.groupby("configuration", sort=False)) if told else []
+            truths.append({**truth, "configuration": configuration})
+    found = pd.json_normalize(truths)
+    groups = list(found.groupby("configuration", sort=False)) if truths else []
     for name, some in [*groups, (_ALL, found)] if len(groups) > 1 else groups:
         line = {"configuration": str(name), "trials": len(some)}
         for heading, (column, factor) in _TRUE_POSES.items():
@@ -228,12 +235,12 @@ def true_pose_table(evaluation: Evaluation) -> Table:
 
 
 def has_faults(rows: pd.DataFrame) -> bool:
-    """Whether a session of these rows had faults."""
+    """Return whether a session of these rows had faults."""
     return not set(rows["faults"].dropna()) <= {CLEAN}
 
 
 def tables_by_faults(rows: pd.DataFrame, styles: Styles) -> list[Table]:
-    """Tables by level. Without faults: whether sets hold the truth, if a method says so."""
+    """Return tables by level; without faults whether sets hold the truth, if a method says so."""
     levels = rows["faults"].fillna(CLEAN)
     order = [level for level in dict.fromkeys([*LEVELS, *levels]) if (levels == level).any()]
     rows = rows.assign(faults=levels)
@@ -259,7 +266,7 @@ def tables_by_faults(rows: pd.DataFrame, styles: Styles) -> list[Table]:
 
 
 def against_baseline(evaluation: Evaluation, baseline: str) -> list[Table]:
-    """Tables of all methods beside one of them. Raises SettingError if that has no PD."""
+    """Return tables of all methods beside one; raise SettingError if that has no PD."""
     rows, styles = statistics.with_ratios(evaluation.rows, baseline), styles_of(evaluation.methods)
     if rows["ratio"].isna().all():
         known = ", ".join(sorted(rows["method"].unique()))
@@ -299,7 +306,7 @@ def against_baseline(evaluation: Evaluation, baseline: str) -> list[Table]:
 
 
 def pd_over_probes(name: str, rows: pd.DataFrame, styles: Styles) -> Picture | None:
-    """Medians and quartiles of PD at every step, by object and method."""
+    """Return medians and quartiles of PD at every step, by object and method."""
     rows = rows[rows["method"].isin(list(styles)) & rows[DIVERSITY].notna()]
     found = statistics.spreads(rows, ["object", "method", "step"], DIVERSITY).reset_index()
     data = found[["object", "method", "step", *_QUARTILES]]
@@ -307,7 +314,7 @@ def pd_over_probes(name: str, rows: pd.DataFrame, styles: Styles) -> Picture | N
 
 
 def _times_table(rows: pd.DataFrame, styles: Styles) -> Table:
-    """Milliseconds of a registration, a row for every method."""
+    """Return milliseconds of a registration, a row for every method."""
     found = statistics.spreads(rows.assign(ms=_MM * rows["seconds"]), "method", "ms")
     found = found.query("count > 0").reindex(list(styles)).dropna().astype({"count": int})
     cells = median_cells(found.assign(left_out=0, count=1), "min")
@@ -334,7 +341,7 @@ def _over_iterations(moments: pd.DataFrame, styles: Styles) -> Part:
 
 
 def _calibration(half: pd.DataFrame, styles: Styles) -> list[Table]:
-    """The rank of the true pose among the hypotheses, and how many hypotheses are plausible."""
+    """Return the rank of the true pose among hypotheses, and how many of these are plausible."""
     ranks, members = half[half["rank"].notna()], half[half["exact_members"].notna()]
     note = "0.5 in the median for a set that spreads as far as it errs; small: the truth is outside"
     title = "Rank of the true pose among the hypotheses"
@@ -378,7 +385,7 @@ def _on_policies(
 
 
 def error_table(sessions: SteeredSessions, styles: Styles) -> Table:
-    """Geometric means of the errors after so many probes, mm."""
+    """Return geometric means of the errors after so many probes, mm."""
     return _means_table(sessions, styles, "error", "Error of the set after so many probes, mm")
 
 
@@ -394,14 +401,14 @@ def _means_table(sessions: SteeredSessions, styles: Styles, column: str, title: 
 
 
 def _means_over_probes(sessions: SteeredSessions, styles: Styles) -> Picture | None:
-    """Errors and spreads with their intervals, mm."""
+    """Return errors and spreads with their intervals, mm."""
     data = pd.concat([statistics.means_with_intervals(sessions, name) for name in _OVER_PROBES])
     data[["lower", "mean", "upper"]] *= _MM
     return curves("error_over_probes", data, styles, "probes", _OVER_PROBES)
 
 
 def needed_table(sessions: SteeredSessions, styles: Styles) -> Table:
-    """Median [quartiles] of the probes to each limit, and shares of the sessions that get there."""
+    """Return median [quartiles] of the probes to each limit, and shares of sessions within it."""
     lines = []
     for policy in sessions.policies:
         errors = sessions.errors.loc[policy]
@@ -429,13 +436,13 @@ def _quartiles(needed: pd.Series, budget: int) -> str:
 
 
 def _share(flags: pd.Series) -> str:
-    """How many of the flags are set, with its interval."""
+    """Return the share of the flags that are set, with its interval."""
     found = shares(pd.DataFrame({_ALL: 0, "flag": flags}), _ALL, "flag")
     return percent_range(found.iloc[0]) if len(found) else "-"
 
 
 def _compared(sessions: SteeredSessions, styles: Styles) -> list[Table]:
-    """Every policy beside the reference, session by session; and all of them by configuration."""
+    """Return tables of every policy beside the reference, by session and by configuration."""
     if len(styles) < 2:
         return []
     reference, lines = styles[sessions.reference].title, []
@@ -461,7 +468,7 @@ def _compared(sessions: SteeredSessions, styles: Styles) -> list[Table]:
 
 
 def _by_table(sessions: SteeredSessions, styles: Styles, by: str) -> Table:
-    """Geometric means of the errors by what a column of the rows holds, mm."""
+    """Return geometric means of the errors by what a column of the rows holds, mm."""
     cells, counts = {}, {}
     for value, some in sessions.rows.groupby(by):
         trials = pd.MultiIndex.from_frame(some[TRIAL].drop_duplicates())
@@ -479,7 +486,7 @@ def _bold(means: pd.Series) -> list[str]:
 
 
 def _hit_tables(sessions: SteeredSessions, styles: Styles) -> list[Table]:
-    """Whether chances of a hit come true."""
+    """Return tables of hits beside their forecast chances."""
     rows, lines = sessions.forecasts, []
     groups = {styles[policy].title: rows["policy"] == policy for policy in sessions.policies}
     groups["all, before the first contact"] = ~rows["touched"]
@@ -497,7 +504,7 @@ def _hit_tables(sessions: SteeredSessions, styles: Styles) -> list[Table]:
 
 
 def _tenths(rows: pd.DataFrame, forecast: str, happened: str, counted: str) -> list[dict[str, Any]]:
-    """A line for every tenth of a chance, with what happened."""
+    """Return a line for every tenth of a chance, with what happened."""
     lines = []
     for tenth, of in statistics.by_tenths(rows, forecast, happened).iterrows():
         line = {"forecast": f"{10 * tenth} to {10 * tenth + 10} %", counted: int(of["total"])}
@@ -507,7 +514,7 @@ def _tenths(rows: pd.DataFrame, forecast: str, happened: str, counted: str) -> l
 
 
 def _belief_tables(sessions: SteeredSessions) -> list[Table]:
-    """Whether the middle of the members has the true pose, and whether grasps work as told."""
+    """Return how often the middle of the members has the true pose, and how often grasps work."""
     rows = sessions.rows[sessions.rows["grasp_chance"].notna()]
     lines = []
     for first, last in _CONTACTS:
@@ -526,7 +533,7 @@ def _belief_tables(sessions: SteeredSessions) -> list[Table]:
 
 
 def _stops_table(sessions: SteeredSessions, styles: Styles) -> Table:
-    """A row for every policy and spread at which it would stop."""
+    """Return a row for every policy and spread at which it would stop."""
     lines: list[dict[str, Any]] = []
     for spread in _STOP_SPREADS:
         stops = statistics.first_stops(sessions.rows, spread)

@@ -26,7 +26,7 @@ _RESAMPLES, _FEW = 2000, 5
 
 
 def spreads(rows: pd.DataFrame, by: str | Sequence[str], column: str) -> pd.DataFrame:
-    """A row per group with the spread of a column's numbers; NaN where there are none.
+    """Return a row per group with the spread of a column's numbers; NaN where there are none.
 
     left_out: how many are missing. lower, upper: quartiles, interpolated; a single number has none.
     deviation: over n.
@@ -47,7 +47,7 @@ def spreads(rows: pd.DataFrame, by: str | Sequence[str], column: str) -> pd.Data
 
 
 def shares(rows: pd.DataFrame, by: str | Sequence[str], column: str) -> pd.DataFrame:
-    """A row per group with flags in a column: how many are set, of how many, and their share.
+    """Return a row per group with flags: how many are set, of how many, and their share.
 
     lower, upper: 95 % interval of the share of independent cases (Wilson's score interval).
     """
@@ -59,19 +59,19 @@ def shares(rows: pd.DataFrame, by: str | Sequence[str], column: str) -> pd.DataF
 
 
 def geometric_mean(values: pd.Series) -> float:
-    """Of positive numbers, without those that are NaN; NaN of nothing."""
+    """Return the geometric mean of positive numbers, without NaN; NaN of nothing."""
     return math.exp(np.log(values).mean())
 
 
 def ratio_interval(rows: pd.DataFrame) -> tuple[float, float, float]:
-    """Geometric mean of `with_ratios`, and its 95 % interval, NaN of a single session."""
+    """Return the geometric mean of `with_ratios`, and its 95 % interval, NaN of one session."""
     logs = np.log(rows.set_index(TRIAL)["ratio"].dropna())
     mean, lower, upper = (math.exp(log) for log in (logs.mean(), *bootstrap_interval(logs)))
     return mean, lower, upper
 
 
 def with_ratios(rows: pd.DataFrame, baseline: str) -> pd.DataFrame:
-    """The rows with `floored`, PD of at least LEAST_PD, and `ratio`, that by the baseline's.
+    """Return the rows with `floored`, PD of at least LEAST_PD, and `ratio`, that by the baseline's.
 
     Of the baseline the geometric mean over its draws at the same trial and step.
     """
@@ -83,7 +83,7 @@ def with_ratios(rows: pd.DataFrame, baseline: str) -> pd.DataFrame:
 
 
 def bootstrap_interval(values: pd.Series) -> tuple[float, float]:
-    """95 % interval of the mean of values by (configuration, seed), configurations resampled.
+    """Return the 95 % interval of a mean by (configuration, seed), resampling configurations.
 
     Sessions are resampled if there are less than _FEW configurations; NaN of a single session.
     """
@@ -99,13 +99,13 @@ def bootstrap_interval(values: pd.Series) -> tuple[float, float]:
 
 
 def first_below(values: pd.DataFrame, limit: float) -> pd.Series:
-    """The number of probes (columns) after which sessions (rows) are first below; else infinite."""
+    """Return the number of probes (columns) after which sessions (rows) are first below."""
     below = values < limit
     return below.idxmax(axis=1).where(below.any(axis=1), np.inf).astype(float)
 
 
 def censored_quantile(numbers: pd.Series, share: float) -> float:
-    """The least number by which this share of the sessions, or none, has come there: Kaplan-Meier.
+    """Return the least number by which this share of sessions has come there (Kaplan-Meier).
 
     Sessions that never do are infinite: nothing is censored before the budget is spent.
     """
@@ -113,7 +113,7 @@ def censored_quantile(numbers: pd.Series, share: float) -> float:
 
 
 def by_tenths(rows: pd.DataFrame, forecast: str, happened: str) -> pd.DataFrame:
-    """`shares` of what happened by tenths of the forecast, with the mean `forecast` of each."""
+    """Return `shares` by tenths of the forecast, with the mean `forecast` of each."""
     tenths = np.digitize(rows[forecast], np.linspace(0.0, 1.0, 11)).clip(max=10) - 1
     rows = rows.assign(tenth=tenths)
     forecasts = rows.groupby("tenth")[forecast].mean()
@@ -137,7 +137,7 @@ class SteeredSessions:
         return self.over_probes("error")
 
     def over_probes(self, column: str) -> pd.DataFrame:
-        """A row per session (policy, configuration, seed), a column per number of probes.
+        """Return a row per session (policy, configuration, seed), a column per number of probes.
 
         A session that ends before others keeps its last number.
         """
@@ -164,7 +164,7 @@ class SteeredSessions:
 
 
 def steered_sessions(evaluation: Evaluation, reference: str | None = None) -> SteeredSessions:
-    """The sessions of an evaluation. Raises SettingError for a reference without any."""
+    """Return the sessions of an evaluation; raise SettingError for a reference without any."""
     rows = evaluation.probes
     rows = rows[rows["probes"].notna()].astype({"probes": int})
     first = rows[rows["error"].notna()].groupby(SESSION)["probes"].min()
@@ -185,7 +185,7 @@ def steered_sessions(evaluation: Evaluation, reference: str | None = None) -> St
 
 
 def geometric_means(values: pd.DataFrame) -> pd.DataFrame:
-    """By policy and number of probes, of `over_probes`, metres."""
+    """Return means of `over_probes` by policy and number of probes, metres."""
     return np.exp(_logs(values).groupby("policy", sort=False).mean())
 
 
@@ -194,7 +194,7 @@ def _logs(errors: Any) -> Any:
 
 
 def means_with_intervals(sessions: SteeredSessions, column: str) -> pd.DataFrame:
-    """By number (the column), policy and probes: `mean`, geometric, and its 95 % interval."""
+    """Return `mean`, geometric, and its 95 % interval by number (the column), policy and probes."""
     logs, lines = _logs(sessions.over_probes(column)), []
     for policy in sessions.policies:
         for probes, own in logs.loc[policy].items():
@@ -204,13 +204,13 @@ def means_with_intervals(sessions: SteeredSessions, column: str) -> pd.DataFrame
 
 
 def ratios_to_best(sessions: SteeredSessions) -> pd.Series:
-    """Error of the reference by that of the best other policy, by number of probes."""
+    """Return error of the reference by that of the best other policy, by number of probes."""
     means = geometric_means(sessions.errors)
     return means.loc[sessions.reference] / means.drop(index=sessions.reference).min()
 
 
 def paired(sessions: SteeredSessions, policy: str) -> dict[str, float]:
-    """A policy beside the reference, whose wins and losses these are, over the same sessions.
+    """Return wins and losses of the reference against a policy over the same sessions.
 
     sign_test: chance of wins and losses as uneven if both were as good. Of the policy's error by
     the reference's: median, geometric mean, and its 95 % interval.
@@ -226,6 +226,6 @@ def paired(sessions: SteeredSessions, policy: str) -> dict[str, float]:
 
 
 def first_stops(rows: pd.DataFrame, spread: float) -> pd.DataFrame:
-    """Of each session the first row with at most this spread of the belief, metres."""
+    """Return the first row of each session with at most this spread of the belief, metres."""
     narrow = rows[rows["spread"] <= spread].sort_values([*SESSION, "probes"])
     return narrow.drop_duplicates(SESSION)

@@ -31,7 +31,7 @@ class Table:
 def table_of(
     title: str, lines: Iterable[Mapping[str, Any]], *, labels: int = 1, note: str = ""
 ) -> Table:
-    """A row for each line, of cells by heading: texts, counts (int) or numbers (float)."""
+    """Return a row for each line, of cells by heading: texts, counts (int) or numbers (float)."""
     lines = list(lines)
     rows = [
         tuple(number(cell) if isinstance(cell, float) else str(cell) for cell in line.values())
@@ -41,7 +41,7 @@ def table_of(
 
 
 def number(value: float) -> str:
-    """Three significant digits, from a thousand on all before the point; "-" for NaN."""
+    """Return three significant digits, from a thousand on all before the point; "-" for NaN."""
     if not math.isfinite(value):
         return "-"
     if value != 0.0 and abs(value) < 1e-3:
@@ -51,24 +51,24 @@ def number(value: float) -> str:
 
 
 def with_range(value: float, lower: float, upper: float) -> str:
-    """A number and a range, such as quartiles: "26.1 [17.5, 37.5]"; alone if that is NaN."""
+    """Return a number and a range, such as quartiles: "26.1 [17.5, 37.5]"; alone if that is NaN."""
     known = f" [{number(lower)}, {number(upper)}]" if math.isfinite(lower) else ""
     return number(value) + known
 
 
 def percent(share: float) -> str:
-    """A share, "12.5 %"."""
+    """Return a share, "12.5 %"."""
     return f"{100.0 * share:.1f} %" if math.isfinite(share) else "-"
 
 
 def percent_range(found: Any) -> str:
-    """A share with its interval, of a row of `shares`."""
+    """Return a share with its interval, of a row of `shares`."""
     share, lower, upper = (100.0 * found[name] for name in ("share", "lower", "upper"))
     return f"{share:.0f} % [{lower:.0f}, {upper:.0f}]"
 
 
 def bold_best(values: Sequence[float], texts: Sequence[str], best: Best = "min") -> list[str]:
-    """The texts of some values, the best in bold, if there are several values."""
+    """Return the texts of some values, the best in bold, if there are several values."""
     known = [value for value in values if math.isfinite(value)]
     bold = {"min": min, "max": max}[best](known) if best and len(known) > 1 else None
     return [
@@ -77,7 +77,7 @@ def bold_best(values: Sequence[float], texts: Sequence[str], best: Best = "min")
 
 
 def median_cells(found: pd.DataFrame, best: Best) -> list[str]:
-    """Median [quartiles] of each of the `spreads`; notes where numbers are fewer than elsewhere."""
+    """Return median [quartiles] of each of the `spreads`; a note where numbers are fewer."""
     most, cells = found["count"].max(), []
     for _, each in found.iterrows():
         notes = [f"n {each['count']:.0f}"] if 0 < each["count"] < most else []
@@ -90,7 +90,7 @@ def median_cells(found: pd.DataFrame, best: Best) -> list[str]:
 def method_table(
     title: str, rows: pd.DataFrame, by: str, styles: Styles, column: str = DIVERSITY, note: str = ""
 ) -> Table:
-    """Median [quartiles] of a column by what another one holds (rows) and by method (columns).
+    """Return median [quartiles] of a column by the values of another (rows) and by method.
 
     n: of numbers behind a median; a cell that has fewer says so.
     """
@@ -107,7 +107,7 @@ def method_table(
 def pivot_table(
     title: str, cells: pd.DataFrame, styles: Styles, counts: Any = None, note: str = ""
 ) -> Table:
-    """Texts by the index (rows) and by method or policy (columns); counts: n by row."""
+    """Return texts by the index (rows) and by method or policy (columns). counts: n by row."""
     lines = []
     for value, texts in cells.reindex(columns=list(styles)).fillna("-").iterrows():
         line = {str(cells.index.name): str(value), **({"n": counts[value]} if counts else {})}
@@ -116,7 +116,7 @@ def pivot_table(
 
 
 def print_table(console: Console, table: Table) -> None:
-    """A table with its title and its note; as wide as it is where there is no terminal."""
+    """Print a table with its title and its note; as wide as it is where there is no terminal."""
     texts, numbers = table.header[: table.labels], table.header[table.labels :]
     shown = plain_table(texts=texts, numbers=numbers)
     for column in shown.columns:

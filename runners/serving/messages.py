@@ -50,7 +50,7 @@ class OpenRequest(CheckedSettings):
 
 
 def parsed(body: bytes) -> Json:
-    """The JSON object of a request; an empty body is an empty one."""
+    """Return the JSON object of a request; an empty body is an empty one."""
     try:
         values = json.loads(body or b"{}")
     except (ValueError, RecursionError) as error:
@@ -61,7 +61,7 @@ def parsed(body: bytes) -> Json:
 
 
 def open_session(body: bytes, folder: Path) -> tuple[Session, Json]:
-    """A new session, recorded in the folder, and what its client gets to know."""
+    """Return a new session, recorded in the folder, and the answer to its client."""
     request = build_settings(OpenRequest, parsed(body), "open")
     arguments = dict(vars(request))
     if not isinstance(request.target, str):  # whose path also names the object
@@ -133,11 +133,11 @@ REQUESTS: dict[str, tuple[Callable[[Session, Json], Json], tuple[str, ...]]] = {
     "next_probe": (next_probe, tuple(Actions.__dataclass_fields__)),
     "close": (close, ()),
 }
-"""What answers a request to a session, and the names that the request may have."""
+"""The function that answers a request to a session, and the names that the request may have."""
 
 
 def answered(request: str, session: Session, body: bytes) -> Json:
-    """The answer to one of REQUESTS."""
+    """Return the answer to one of REQUESTS."""
     answer, accepted = REQUESTS[request]
     values = parsed(body)
     for name in values:
@@ -146,7 +146,7 @@ def answered(request: str, session: Session, body: bytes) -> Json:
 
 
 def plain(value: Any) -> Any:
-    """An answer as lists and numbers; those that are not finite are None."""
+    """Return an answer as lists and numbers; those that are not finite are None."""
     if isinstance(value, np.ndarray):
         return plain(value.tolist())
     if isinstance(value, dict):
@@ -161,7 +161,7 @@ def _warnings(session: Session) -> list[Json]:
 
 
 def _mesh(name: str, value: Any) -> trimesh.Trimesh:
-    """The mesh in a file of the server, or of vertices (V, 3), metres, and faces (F, 3)."""
+    """Return the mesh in a file of the server, or of vertices (V, 3), metres, and faces (F, 3)."""
     if isinstance(value, str):
         return load_mesh(value)
     if not isinstance(value, Mapping) or value.keys() != {"vertices", "faces"}:
@@ -172,7 +172,7 @@ def _mesh(name: str, value: Any) -> trimesh.Trimesh:
 
 
 def _arrays(values: Mapping[str, Any]) -> Json:
-    """The arrays, in any shape: nested lists, NaN for null, or packed; without those of null."""
+    """Return the arrays: nested lists, NaN for null, or packed; nulls are left out."""
     arrays = {}
     for name, value in values.items():
         try:

@@ -40,7 +40,7 @@ class Server:
     """The sessions that are open, and the application that offers them."""
 
     def __init__(self, token: str, folder: Path) -> None:
-        """token: that every request must bring. folder: where recordings go."""
+        """Start without sessions. token: of every request. folder: of the recordings."""
         self._token, self._folder = token, folder
         self._served: dict[str, _Served] = {}
         self._count = 0  # sessions opened so far
@@ -61,7 +61,7 @@ class Server:
     async def _answered(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[Any]]
     ) -> web.Response:
-        """The answer as JSON, to who has the token; an error is one line."""
+        """Return the answer as JSON, if the token is right; an error is one line."""
         header = request.headers.get("Authorization", "").encode(errors="replace")
         status = 200
         try:
@@ -137,7 +137,7 @@ class Server:
 
 
 async def _body(request: web.Request) -> bytes:
-    """The body of a request, unpacked. Raises SettingError if that cannot be done."""
+    """Return the body of a request, unpacked; raise SettingError if that cannot be done."""
     body, encoding = await request.read(), request.headers.get("Content-Encoding", "").lower()
     if encoding in ("", "identity"):
         return body

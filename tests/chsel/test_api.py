@@ -1,3 +1,5 @@
+"""`chsel.register` and the public names: what they accept, warn of and refuse."""
+
 import dataclasses
 import re
 import warnings
@@ -91,7 +93,7 @@ def warned(**arguments):
 
 
 FREE = np.random.default_rng(0).uniform(-0.3, 0.3, (4000, 3)) + POSE[:3, 3]
-AWAY = chsel.SdfGrid.from_mesh(BOX, 0.005, padding=0.5).at(apply(inverse(POSE), FREE))[0]
+AWAY = (np.abs(apply(inverse(POSE), FREE)) - BOX.extents / 2).max(axis=1)
 FREE = FREE[AWAY > 0.005]
 NOISE = np.random.default_rng(0).normal(0.0, 0.004, SURFACE.shape)
 ANCHORED = {"method": "anchored", "settings": {"size": "small", "noise": 0.0001}}

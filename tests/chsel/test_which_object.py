@@ -1,3 +1,5 @@
+"""Which of several objects is touched: rows, refusals, and the next action."""
+
 import numpy as np
 import pytest
 import trimesh

@@ -1,4 +1,4 @@
-"""A program that knows docs/format.md, the package mcap and numpy reads recordings as ours does."""
+"""A program that knows docs/format*.md, mcap and numpy reads recordings as ours does."""
 
 import hashlib
 import re
@@ -14,8 +14,9 @@ from replay.mcap.reader import read_recording
 from replay.mcap.schemas import MESSAGES
 from tests.chsel.samples import REPOSITORY
 
-PAGE = (REPOSITORY / "docs" / "format.md").read_text()
-SECTIONS = re.findall(r"^### `chsel\.(\w+)`\n(.*?)(?=^##|\Z)", PAGE, re.MULTILINE | re.DOTALL)
+NAMES = ("format", "format_probes", "format_results")
+PAGES = "\n".join((REPOSITORY / "docs" / f"{name}.md").read_text() for name in NAMES)
+SECTIONS = re.findall(r"^### `chsel\.(\w+)`\n(.*?)(?=^#|\Z)", PAGES, re.MULTILINE | re.DOTALL)
 ROW = re.compile(r"^\| (\d+) \| `(\w+)` \| `([^`]+)` \|", re.MULTILINE)
 FIELDS = {name: {int(n): tuple(row) for n, *row in ROW.findall(text)} for name, text in SECTIONS}
 CLOUD = {"PointCloud": {6: ("data", "bytes")}}
@@ -65,7 +66,7 @@ def test_the_tables_are_those_of_the_code():
 
 
 @pytest.mark.parametrize("name", ["mustard_anchored", "box_steered"])
-def test_what_the_page_says_is_enough_to_read(name):
+def test_what_the_pages_say_is_enough_to_read(name):
     path, topics = REPOSITORY / "tests" / "replays" / f"{name}.mcap", defaultdict(list)
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)

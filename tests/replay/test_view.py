@@ -1,3 +1,5 @@
+"""`replay view` and `replay info`: viewers, web pages, sessions and foreign logs."""
+
 import os
 import re
 import signal

@@ -1,3 +1,5 @@
+"""The command that finds the true pose of a recorded object near a guess."""
+
 import shutil
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Evaluations and sweeps on clusters: other folders, SLURM, keys and lost schedulers."""
+
 import asyncio
 import importlib.util
 import json

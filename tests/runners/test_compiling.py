@@ -1,3 +1,5 @@
+"""Kernels are compiled before the first probe, and none later."""
+
 import os
 import re
 import subprocess

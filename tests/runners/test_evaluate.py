@@ -1,3 +1,5 @@
+"""`python -m runners.evaluate` as a user runs it: tables, metrics, interruptions."""
+
 import json
 import os
 import re

@@ -1,3 +1,5 @@
+"""Parts of an evaluation: plans, contenders, failed tasks and sets from outside."""
+
 import json
 import os
 import signal

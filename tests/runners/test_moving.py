@@ -1,3 +1,5 @@
+"""Objects that move along each push: contacts, errors and recorded problems."""
+
 import numpy as np
 import pytest
 

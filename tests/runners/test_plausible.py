@@ -1,3 +1,5 @@
+"""The command that makes plausible sets of a recording or of points."""
+
 import os
 
 import numpy as np

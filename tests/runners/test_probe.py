@@ -1,3 +1,5 @@
+"""`python -m runners.probe`: what it prints, records and refuses."""
+
 import json
 import os
 import signal

@@ -1,3 +1,5 @@
+"""Folders of runs, traces as they are handed over, and points of files and arrays."""
+
 import numpy as np
 import pytest
 import trimesh

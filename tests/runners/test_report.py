@@ -9,7 +9,7 @@ import pytest
 from runners import report
 from runners.reporting.evaluation_folder import last_half, open_evaluation
 from runners.reporting.figures import styles_of
-from runners.reporting.sections import pd_over_probes, sections_of
+from runners.reporting.sections import _TEXTS, pd_over_probes, sections_of
 from runners.reporting.statistics import spreads
 from runners.reporting.tables import median_cells
 from tests.runners.in_process import run
@@ -51,6 +51,14 @@ def test_without_faults_nothing_is_said_about_them(tmp_path):
     (held,) = [section for section in sections if section.title == "Whether sets hold the truth"]
     (table,) = held.tables
     assert table.rows == (("clean", "100 % [21, 100] (n 1)"),)
+
+
+@pytest.mark.parametrize("title", ["Time per registration", "Calibration and membership"])
+def test_a_section_without_its_text_is_an_error(tmp_path, monkeypatch, title):
+    folder = write_evaluation(tmp_path, [row("can", 0, "icp", 4, diversity=8.0)])
+    monkeypatch.delitem(_TEXTS, title)
+    with pytest.raises(KeyError, match=title):
+        sections_of(open_evaluation(folder))
 
 
 def test_tables_hold_medians_over_trials_and_the_last_half_of_their_steps(tmp_path):

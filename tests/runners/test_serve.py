@@ -1,3 +1,5 @@
+"""The server of sessions: clients at once, mistakes, encodings and signals."""
+
 import asyncio
 import base64
 import gzip

@@ -1,3 +1,5 @@
+"""The command that simulates the raw log of a rig."""
+
 import numpy as np
 import pytest
 import yaml

@@ -1,3 +1,5 @@
+"""Start of all commands: help, imports, Ctrl-C, and another package of our name."""
+
 import importlib
 import os
 import signal

@@ -1,3 +1,5 @@
+"""Steered runs of `runners.probe`: decisions, stops, grasps and surprises."""
+
 import json
 import re
 

@@ -1,3 +1,5 @@
+"""The relaxed cost in torch: closed forms of its terms, and its gradient."""
+
 from dataclasses import replace
 
 import numpy as np

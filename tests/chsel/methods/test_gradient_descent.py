@@ -1,3 +1,5 @@
+"""Descent by Adam beside that of torch, its race, and when it ends."""
+
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+"""ICP beside that of trimesh, and the objects that it finds."""
+
 import numpy as np
 import pytest
 import trimesh

@@ -1,3 +1,5 @@
+"""SVGD beside its equations in torch, and the object that it finds."""
+
 from __future__ import annotations
 
 import numba

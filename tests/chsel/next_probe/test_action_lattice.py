@@ -1,3 +1,5 @@
+"""The lattice of actions around a workspace: places, directions, reach and spacing."""
+
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,3 +1,5 @@
+"""Pointers of Git LFS are named by every reader of files."""
+
 from pathlib import Path
 
 import pytest

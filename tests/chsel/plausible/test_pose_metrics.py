@@ -1,3 +1,5 @@
+"""Errors of poses modulo symmetries, and the hypothesis closest to the truth."""
+
 import numpy as np
 import pytest
 import trimesh

@@ -1,3 +1,5 @@
+"""Symmetries of bodies whose groups are known, and of scans."""
+
 from dataclasses import replace
 from itertools import permutations, product
 

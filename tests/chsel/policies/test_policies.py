@@ -1,3 +1,5 @@
+"""Scores and choices of all policies, and when they stop."""
+
 from dataclasses import replace
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Meshes of files in all formats: units, parts, orientation, and warnings about them."""
+
 import warnings
 import zipfile
 

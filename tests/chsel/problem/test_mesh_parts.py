@@ -1,3 +1,5 @@
+"""Overlapping, touching, mirrored and hollow parts of a mesh become one solid."""
+
 import warnings
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Grids of signed distances against closed forms, and warnings about thin walls."""
+
 import re
 import warnings
 

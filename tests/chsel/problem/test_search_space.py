@@ -1,3 +1,5 @@
+"""Search vectors of poses, in space and on a plane, and rotations and quaternions."""
+
 import numpy as np
 import pytest
 import torch

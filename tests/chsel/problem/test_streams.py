@@ -1,3 +1,5 @@
+"""Random streams: their numbers, their keys, and draws inside kernels."""
+
 import numba
 import numpy as np
 import pytest

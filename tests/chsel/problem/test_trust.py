@@ -42,8 +42,11 @@ BOX = trimesh.creation.box(SIDES)
 GRID = chsel.SdfGrid.from_mesh(BOX, 0.004)
 CAN = trimesh.creation.cylinder(0.04, 0.12, sections=64)
 RADIUS, VOXEL, NOISE = 0.1, 0.01, 0.001
-BALL = chsel.SdfGrid.from_mesh(trimesh.creation.icosphere(4, RADIUS), 0.005, padding=0.2)
-NORMALS = trimesh.sample.sample_surface(trimesh.creation.icosphere(4, 1.0), 60, seed=0)[0]
+NODES = np.moveaxis(np.indices((121, 121, 121)), 0, -1) * 0.005 - 0.3
+FROM_CENTRE = np.linalg.norm(NODES, axis=-1)
+GRADIENTS = NODES / np.maximum(FROM_CENTRE, 1e-9)[..., None]
+BALL = chsel.SdfGrid(np.full(3, -0.3), 0.005, FROM_CENTRE - RADIUS, GRADIENTS)
+NORMALS = trimesh.unitize(np.random.default_rng(0).standard_normal((60, 3)))
 CENTRE = np.array([0.3, 0.2, 0.1])
 POSE = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(0.7)), CENTRE)  # world_from_object
 BEST = Poses.of(inverse(POSE[None]))
@@ -102,8 +105,10 @@ def test_numbers_are_those_of_the_points_at_the_best_hypothesis():
     assert trust.outliers < 0.01
     for misfit, codes in ((MOST_LEVELS, []), (1.001 * MOST_LEVELS, ["above_noise"])):
         assert [each.code for each in check_trust(replace(trust, misfit=misfit))] == codes
-    one = judged(TURNED_BALL, NOISE, known=at_height(0.0005)[:1], free=CENTRE[None] + 0.9)
-    assert one.misfit == pytest.approx(0.5, rel=0.03)
+    upright = hypotheses(compose(np.eye(3), CENTRE))  # on its axes the grid is exact
+    known = CENTRE[None] + np.array([RADIUS + 0.0005, 0.0, 0.0])
+    one = judged(upright, NOISE, known=known, free=CENTRE[None] + 0.9)
+    assert one.misfit == pytest.approx(0.5, rel=1e-6)
     assert trust.numbers["verdict"] == VERDICTS.index("determined") == 0
 
 

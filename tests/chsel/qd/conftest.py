@@ -1,3 +1,5 @@
+"""The compiled searches of quality diversity, around another cost than that of poses."""
+
 from typing import Any
 
 import numba

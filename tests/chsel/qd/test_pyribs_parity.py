@@ -1,3 +1,5 @@
+"""The compiled search gives the archive of pyribs, by shared random numbers."""
+
 from functools import partial
 from typing import Any, NamedTuple
 

@@ -1,3 +1,5 @@
+"""Elites that are selected, the extent of an archive, and the order of hypotheses."""
+
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

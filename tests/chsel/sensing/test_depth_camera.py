@@ -1,3 +1,5 @@
+"""Depth images: pixels, regions, edges, rays, and cameras that are refused."""
+
 import numpy as np
 import pytest
 

@@ -1,3 +1,5 @@
+"""The view of a comparison: hypotheses at their poses, ranked by one judge."""
+
 import numpy as np
 import pytest
 

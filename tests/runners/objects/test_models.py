@@ -1,3 +1,5 @@
+"""Models of the objects beside their scans, and the download of a scan."""
+
 import io
 import tarfile
 from pathlib import Path

@@ -1,3 +1,5 @@
+"""One depth image in place of a log: files, labels, warnings and refusals."""
+
 import dataclasses
 import json
 import struct

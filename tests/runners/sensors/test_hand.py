@@ -1,3 +1,5 @@
+"""The shape of a hand from boxes, meshes and URDF files."""
+
 import numpy as np
 import pytest
 import trimesh

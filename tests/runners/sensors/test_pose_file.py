@@ -1,3 +1,5 @@
+"""The file of a pose that a person set: written, read and refused."""
+
 import numpy as np
 import pytest
 import yaml

@@ -1,3 +1,5 @@
+"""Kinematic and simulated sessions with a hand from a URDF file."""
+
 import re
 from dataclasses import replace
 

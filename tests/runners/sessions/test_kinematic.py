@@ -1,3 +1,5 @@
+"""The kinematic session: contacts, free space, seeds and boundaries."""
+
 import re
 from dataclasses import replace
 from pathlib import Path

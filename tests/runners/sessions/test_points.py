@@ -1,3 +1,5 @@
+"""Sessions of points in files: formats, steps, repeated places and refusals."""
+
 import numpy as np
 import pytest
 import trimesh

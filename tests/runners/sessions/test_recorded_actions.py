@@ -1,3 +1,5 @@
+"""A recorded grid offers its probes as actions, in any order."""
+
 from dataclasses import replace
 from pathlib import Path
 

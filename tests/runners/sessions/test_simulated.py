@@ -1,3 +1,5 @@
+"""The simulated session beside the geometry of the kinematic one."""
+
 import subprocess
 import sys
 from dataclasses import dataclass

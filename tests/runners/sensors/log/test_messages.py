@@ -1,3 +1,5 @@
+"""Messages of both encodings become their content, or are counted as unusable."""
+
 import struct
 from collections import Counter
 
