@@ -46,7 +46,8 @@ from chsel.events import (
     SessionStarted,
 )
 from chsel.methods import METHODS, MOST_NOISE, build_method, default_method, noise_of
-from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
+from chsel.methods.anchored.anchored import Anchored
+from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.methods.method import Method
 from chsel.next_probe.action_lattice import ActionSettings, around_actions
 from chsel.next_probe.decision_problem import Actions, Decision, HandShape

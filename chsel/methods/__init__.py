@@ -6,7 +6,8 @@ from dataclasses import replace
 from typing import Any
 
 from chsel.errors import require_choice
-from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
+from chsel.methods.anchored.anchored import Anchored
+from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.methods.anchored.pose_bound import pose_bound
 from chsel.methods.chsel import Chsel, ChselSettings
 from chsel.methods.cvo import Cvo, CvoSettings
@@ -51,7 +52,7 @@ MOST_NOISE = 0.25  # of points, in diameters of the object: more is in millimetr
 
 
 def _lacks(method: Any) -> str | None:
-    """What an object with settings lacks to be a method, and what is accepted."""
+    """Return why an object with settings is not a method, and what is; None if it is one."""
     if not isinstance(getattr(method, "online", None), OnlineSettings):
         return "no `online`; accepted: a property that returns OnlineSettings"
     if not callable(getattr(method, "register", None)):
@@ -67,13 +68,13 @@ build_method, preset_settings = _CHOICES.build, _CHOICES.settings
 
 
 def default_method(preset: str = "default") -> str:
-    """The method for points of one's own; of presets that are the paper's, the paper's method."""
+    """Return the method for a program's points; in the paper's presets the paper's method."""
     require_choice("preset", preset, PRESETS)
     return "anchored" if preset == "default" else "chsel"
 
 
 def noise_of(method: Method) -> float:
-    """The noise of known points by a method's settings, metres; SENSOR_NOISE if it has none."""
+    """Return the noise of known points by a method's settings, metres; else SENSOR_NOISE."""
     settings = getattr(method, "settings", None)
     return settings.noise if isinstance(settings, AnchoredSettings) else SENSOR_NOISE
 
