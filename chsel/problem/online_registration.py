@@ -10,7 +10,7 @@ import numpy as np
 
 from chsel.errors import PoseError, require_instance
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.points import KnownPoints, Workspace, require_parts
+from chsel.problem.points import POINT_CLASSES, KnownPoints, Workspace, require_parts
 from chsel.problem.poses import (
     axis_angle,
     compose,
@@ -19,7 +19,7 @@ from chsel.problem.poses import (
     random_rotations,
     rotation_vector,
 )
-from chsel.problem.pushes import CLASSES, Pushes
+from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
@@ -204,7 +204,7 @@ class OnlineRegistration:
         require_parts(points=new_points)
         self.points = self.points.merged(new_points)
         if push is not None:
-            before = [len(getattr(self.points, name)) for name in CLASSES]
+            before = [len(getattr(self.points, name)) for name in POINT_CLASSES]
             self._pushes.append((push, before))
 
     def enough(self, step: int) -> bool:

@@ -3,6 +3,7 @@ import re
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from chsel.errors import SettingError
 from chsel.events import Believed, Decided, Measured, Probe
@@ -97,7 +98,7 @@ def test_a_session_ends_with_a_sure_grasp_and_says_how_sure_it_is_of_each_mode(t
     assert last["grasp_chance"] == 1.0
     # Wilson's interval of n successes in n trials is from n / (n + z^2) to 1.
     lower, upper = last["grasp_chance_interval"]
-    trials = lower / (1.0 - lower) * 1.6449**2
+    trials = lower / (1.0 - lower) * norm.ppf(0.95) ** 2
     assert (trials, upper) == pytest.approx((round(trials), 1.0))
     assert 1 < trials < 31
     assert last["action"] == decided(recording)[-1].decision.chosen
