@@ -10,7 +10,8 @@ from chsel import KnownPoints, OnlineRegistration, Pushes, trust_in
 from chsel.errors import PointsError, SettingError
 from chsel.events import Probe
 from chsel.methods import trust_by
-from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
+from chsel.methods.anchored.anchored import Anchored
+from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses, inverse
 from chsel.problem.surface import outline_distances_to
