@@ -19,8 +19,8 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 
-# Basins whose best pose is a rival of a result: so many that a verdict depends on no other, as more
-# than MOST_MODES of chsel/problem/trust.py that fit make it wide.
+# Basins whose best pose is a rival of a result, where more than eight modes make a verdict wide:
+# docs/anchored.md, "Numbers that are no settings".
 _MOST_RIVALS = 60
 
 

@@ -98,9 +98,7 @@ class AnchoredSettings(CheckedSettings):
     size: Annotated[str, one_of(*EFFORTS)] = "adaptive"  # name of an Effort
     effort: Effort | None = None  # in place of the one that `size` names
     noise: Annotated[float, positive] = 0.0005  # of contacts by the datasheet: deviation, metres
-    rough_noise: Annotated[float, positive] = (
-        0.015  # of the rough fit, which draws from far, metres
-    )
+    rough_noise: Annotated[float, positive] = 0.015  # metres, of the rough fit: draws from far
     limit: Annotated[float, positive] = 9.0  # nats above the lowest energy of candidates
     modes: _Poses = 3  # whose best pose is always among the hypotheses, at most
     reach: Annotated[float, not_negative] = 1.0  # nats above the true pose of plausible ones
