@@ -1,6 +1,6 @@
 """The contact-anchored search: what it finds, and that odd problems have results.
 
-The scene (scene.py): an L of 20 x 14 x 10 cm without symmetry (GRID) is at TRUTH, world_from_object.
+The scene (scene.py): an L of 20 x 14 x 10 cm (GRID) is at TRUTH, world_from_object.
 POINTS are 40 contacts all over it and the free voxels (SIDE) of the workspace around it, ODD odd
 sets of points by name. `posed(method, points, ...)` is the problem that a method gets, with E_0
 anywhere, or from a previous result; `around_truth` are poses near the true one. A Watcher keeps

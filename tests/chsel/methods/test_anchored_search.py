@@ -1,8 +1,8 @@
 """The kernels of anchored: walks and fits.
 
 A box of 20 x 12 x 8 cm (BOX_GRID) is at TRUTH, world_from_object, or upright at STANDING.
-`on_faces(count, height)` are points over its faces in its frame, `poses_around_truth` poses off by a
-length and an angle, `energy_of` the kernel's energy by points and noise, and `plain_energies` the
+`on_faces(count, height)` are points over its faces in its frame, `poses_around_truth` poses off by
+a length and an angle, `energy_of` the kernel's energy by points and noise, and `plain_energies` the
 formula of chsel/problem/noise.py in numpy.
 """
 
