@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -44,7 +45,7 @@ from chsel.sensing.free_space import interior_lattice
 if TYPE_CHECKING:
     import trimesh
 
-_NORMAL = 1.6449  # standard deviations: 90 % of a normal distribution are within
+_CONFIDENCE = 0.9  # of intervals
 _SAME_MODE = 0.1  # of the diameter: as far as a mode moves from one result to the next
 _WIDEST = 2.0  # m: between fingers
 _FINEST = 0.002  # m: nodes of a hand that collides
@@ -360,11 +361,20 @@ def pose_offsets(symmetry: ObjectSymmetry, own: FloatArray, others: FloatArray) 
 
 
 def wilson(share: Any, count: int) -> Chances:
-    """Return shares (G,) of so many trials, with Wilson's 90 % interval."""
-    share, square = np.asarray(share, dtype=np.float64), _NORMAL**2 / count
-    middle = (share + 0.5 * square) / (1.0 + square)
-    half = _NORMAL * np.sqrt(share * (1.0 - share) / count + 0.25 * square / count) / (1.0 + square)
-    return Chances(share, np.maximum(middle - half, 0.0), np.minimum(middle + half, 1.0))
+    """Return shares (G,) of `count` trials with Wilson's interval."""
+    share = np.asarray(share, dtype=np.float64)
+    successes, index = np.unique(np.rint(share * count).astype(int), return_inverse=True)
+    ends = np.array([_interval(number, count) for number in successes.tolist()]).reshape(-1, 2)
+    return Chances(share, lower=ends[index, 0], upper=ends[index, 1])
+
+
+@cache
+def _interval(successes: int, count: int) -> tuple[float, float]:
+    """Return the ends of Wilson's interval of a share."""
+    from scipy.stats import binomtest  # which takes long to import
+
+    low, high = binomtest(successes, count).proportion_ci(_CONFIDENCE, method="wilson")
+    return float(low), float(high)
 
 
 def _nodes(gripper: Gripper) -> tuple[FloatArray, FloatArray]:

@@ -65,12 +65,12 @@ class CompiledCost:
 
     @classmethod
     def of(cls, problem: RegistrationProblem, settings: CostSettings | None = None) -> CompiledCost:
-        """The cost that a problem's points define."""
+        """Return the cost that a problem's points define."""
         resolution = problem.free_resolution
         return cls(problem.sdf, problem.points, settings, free_resolution=resolution)
 
     def at_level(self, sdf: SdfGrid, level: float) -> Model:
-        """The model of direct free points with another penetration tolerance."""
+        """Return the model of direct free points with another penetration tolerance."""
         lookup = self.settings.lookup
         centre, radius = _sphere_around_cells(sdf, level, lookup)
         free = self.model.free._replace(
@@ -81,11 +81,11 @@ class CompiledCost:
         return self.model._replace(free=free, alpha=level)
 
     def evaluate(self, object_from_world: FloatArray) -> FloatArray:
-        """Costs (B,) of transforms (B, 4, 4); infinite for one that is not finite."""
+        """Return costs (B,) of transforms (B, 4, 4); infinite for one that is not finite."""
         return self.costs(Poses.of(object_from_world))
 
     def costs(self, poses: Poses) -> FloatArray:
-        """Costs (B,) of poses."""
+        """Return costs (B,) of poses."""
         costs = np.empty(len(poses))
         run, work = (
             partial(costs_of_poses, self.model, poses.numbers, costs),
@@ -134,7 +134,7 @@ def _free_term(
 
 
 def _sphere_around_cells(sdf: SdfGrid, level: float, lookup: str) -> tuple[Triple, float]:
-    """Centre and radius of a sphere around the cells that read any value below `level`."""
+    """Return centre and radius of a sphere around the cells that read any value below `level`."""
 
     def make() -> tuple[Triple, float]:
         box = cells_below(sdf, level, lookup).box
@@ -148,7 +148,7 @@ def _sphere_around_cells(sdf: SdfGrid, level: float, lookup: str) -> tuple[Tripl
 
 
 def _sphere_around(points: FloatArray, margin: float) -> tuple[Triple, float]:
-    """Centre and radius of a sphere around boxes of half-side `margin` at points (N, 3)."""
+    """Return centre and radius of a sphere around boxes of half-side `margin` at points (N, 3)."""
     lower, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
     half = (upper - lower) / 2.0
     radius = float(np.sqrt((half**2).sum())) * (1.0 + 1e-9) + 1e-9

@@ -34,30 +34,30 @@ _SHORTEST = 1e-12
 
 
 class Model(NamedTuple):
-    """All that the relaxed cost of a pose depends on, but the pose; see CostSettings."""
+    """Data of the relaxed cost, but the pose; see CostSettings."""
 
-    field: DistanceField
-    free: FreeTerm
+    field: DistanceField  # of the object
+    free: FreeTerm  # Eq. 8
     occupied: FloatArray  # (3, K), world
     known: FloatArray  # (3, M), world
     known_sdf: FloatArray  # (M,)
-    alpha: float
-    free_scale: float
-    occupied_scale: float
-    known_scale: float
-    known_tolerance: float
-    exact_gradient: bool
+    alpha: float  # penetration tolerance, metres
+    free_scale: float  # lambda of free points
+    occupied_scale: float  # lambda of occupied points
+    known_scale: float  # of known points
+    known_tolerance: float  # metres that known points may be off
+    exact_gradient: bool  # else as the paper defines it
 
 
 class Work(NamedTuple):
     """Scratch of one thread."""
 
     lanes: FloatArray  # (_SIZE,) rows of LANES
-    near: Neighbours
+    near: Neighbours  # of as many poses as are remembered
 
 
 def work_of(model: Model, poses: int = LANES) -> Work:
-    """Scratch of one thread; it remembers what is near to so many poses, at least LANES."""
+    """Return scratch of one thread; it remembers what is near to so many poses, at least LANES."""
     return Work(scratch(_SIZE), neighbours_of(model.free, max(poses, LANES)))
 
 
@@ -82,13 +82,13 @@ def put_pose(lanes, lane, pose):
 
 @leaf
 def gradient_of(lanes, lane):
-    """The gradient of the cost of a lane by its pose."""
+    """Return the gradient of the cost of a lane by its pose."""
     return _twelve(lanes, SUMS + LANES + lane)
 
 
 @leaf
 def _twelve(lanes, at):
-    """The numbers of a lane in twelve rows, from `at` on."""
+    """Return the numbers of a lane in twelve rows, from `at` on."""
     a, b, c = lanes[at], lanes[at + LANES], lanes[at + 2 * LANES]
     d, e, f = lanes[at + 3 * LANES], lanes[at + 4 * LANES], lanes[at + 5 * LANES]
     g, h, i = lanes[at + 6 * LANES], lanes[at + 7 * LANES], lanes[at + 8 * LANES]
@@ -98,7 +98,7 @@ def _twelve(lanes, at):
 
 @inner
 def evaluate(model, work, first, count, most_slack):
-    """The costs of the poses of the first `count` lanes, and their gradients, in their sums.
+    """Fill sums with the costs of the poses of the first `count` lanes, and their gradients.
 
     Infinite costs for poses that are not finite. first: which of those that are remembered they
     are. most_slack: see free_sums.
@@ -131,7 +131,7 @@ def forget(work):
 
 @inner
 def _add_occupied(model, lanes):
-    """lambda sum max(0, alpha + s), with gradient lambda max(0, alpha + s) n (Eq. 9)."""
+    """Add lambda sum max(0, alpha + s), with gradient lambda max(0, alpha + s) n (Eq. 9)."""
     xs, ys, zs = model.occupied[0], model.occupied[1], model.occupied[2]
     for n in range(len(xs)):
         x, y, z = xs[n], ys[n], zs[n]
@@ -141,7 +141,7 @@ def _add_occupied(model, lanes):
 
 @inner
 def _add_known(model, lanes):
-    """sum |s - v|, with gradient (s - v) n, over points of known signed distance (Eq. 10)."""
+    """Add sum |s - v|, with gradient (s - v) n, over points of known signed distance (Eq. 10)."""
     xs, ys, zs = model.known[0], model.known[1], model.known[2]
     for n in range(len(xs)):
         x, y, z = xs[n], ys[n], zs[n]
@@ -240,7 +240,7 @@ def _locate(box, lanes, x, y, z):
 
 @leaf
 def _go_beyond(box_distance, lanes):
-    """What is read outside of the box, from what was read at its nearest point; see SdfGrid.
+    """Fill distances outside of the box from those at its nearest points; see SdfGrid.
 
     Quotients have a loop of their own: where a choice follows, LLVM divides in a branch, lane by
     lane.

@@ -66,7 +66,7 @@ class CostSettings(CheckedSettings):
             )
 
     def of_object(self, sdf: SdfGrid, free_resolution: float) -> CostSettings:
-        """The settings with alpha for an object, and free voxels of that side in metres."""
+        """Return the settings with alpha for an object, and free voxels of that side in metres."""
         if self.penetration_tolerance is not None:
             return self
         return replace(self, penetration_tolerance=-uncertain_depth(sdf, 0.25 * free_resolution))
@@ -79,7 +79,7 @@ class CostSettings(CheckedSettings):
 
 
 def uncertain_depth(sdf: SdfGrid, depth: float) -> float:
-    """A depth in metres that free points may have, but at most half of the object's greatest.
+    """Return a depth that free points may have, metres, at most half of the object's greatest.
 
     So free points still matter to a thin object.
     """
@@ -103,12 +103,12 @@ class InteriorPoints:
     spacing: float  # of the lattice, metres
 
     def in_order(self, order: IntArray) -> InteriorPoints:
-        """The points in an order (M,) of their indices."""
+        """Return the points in an order (M,) of their indices."""
         points, depth, normals = self.points[order], self.depth[order], self.normals[order]
         return InteriorPoints(points, depth, normals, self.spacing)
 
     def weights(self, settings: CostSettings, free_resolution: float) -> FloatArray:
-        """What each point (M,) costs in a free voxel."""
+        """Return the costs (M,) of points in a free voxel."""
         scale = settings.free_scale
         if settings.volume_normalise:
             scale *= (self.spacing / free_resolution) ** 3
@@ -116,7 +116,7 @@ class InteriorPoints:
 
 
 def interior_points(sdf: SdfGrid, settings: CostSettings) -> InteriorPoints:
-    """The nodes of a lattice over the grid that are deeper than alpha."""
+    """Return the nodes of a lattice over the grid that are deeper than alpha."""
     alpha = settings.alpha
     spacing = settings.interior_spacing or max(-alpha, sdf.resolution / 4)
     lower, upper = sdf.bounds

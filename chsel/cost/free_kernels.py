@@ -41,8 +41,8 @@ _SIZE = 21 * _MOST + 17
 class CostAndGradient(NamedTuple):
     """The relaxed cost of a pose, and its gradient by the pose's 12 numbers."""
 
-    cost: float
-    by_pose: Pose
+    cost: float  # C(X)
+    by_pose: Pose  # its gradient
 
 
 class FreeTerm(NamedTuple):
@@ -57,15 +57,15 @@ class FreeTerm(NamedTuple):
     cells: CellSet  # those of the object that read values below alpha, or free voxels of the world
     weights: FloatArray  # (4 N,) weight of interior points, and it times the inward normal
     centre: Triple  # of a sphere around the object, in its frame
-    radius: float
+    radius: float  # of the sphere, metres
     lower: Triple  # corners of a box of the world: where the object is beyond, nothing costs
-    upper: Triple
+    upper: Triple  # the other corner
 
 
 class Neighbours(NamedTuple):
     """The points that can matter while poses move little (after Verlet, 1967); see remember."""
 
-    points: NearPoints
+    points: NearPoints  # gathered
     slack: FloatArray  # (P,) metres that the object may move until they are gathered anew, or -1
     gathered: FloatArray  # (P, 12) where the object was when they were gathered
     last: FloatArray  # (P, 12) where it was at the last evaluation
@@ -73,7 +73,7 @@ class Neighbours(NamedTuple):
 
 
 def neighbours_of(free: FreeTerm, poses: int) -> Neighbours:
-    """Scratch of one thread, for so many poses."""
+    """Return scratch of one thread, for so many poses."""
     slack = scratch(poses)
     slack[:] = -1.0
     gathered, last = scratch(poses, 12), scratch(poses, 12)
@@ -82,7 +82,7 @@ def neighbours_of(free: FreeTerm, poses: int) -> Neighbours:
 
 @leaf
 def free_sums(model, pose, near, n, most_slack):
-    """The free term of a finite pose, whose neighbours are the n-th.
+    """Return the free term of a finite pose, whose neighbours are the n-th.
 
     most_slack: MOST_SLACK or SEARCH_SLACK in a sequence of poses close to each other, which is
     faster then; 0.0 otherwise. The result is the same to the bit.
@@ -112,7 +112,7 @@ def free_sums(model, pose, near, n, most_slack):
 
 @leaf
 def _slack_to_gather(free, pose, near, n, most_slack):
-    """The slack to gather points with; negative if those gathered last are all that matter."""
+    """Return the slack to gather points with; negative if those gathered last suffice."""
     if most_slack == 0.0:
         near.slack[n] = -1.0
         return 0.0
@@ -128,7 +128,7 @@ def _slack_to_gather(free, pose, near, n, most_slack):
 
 @leaf
 def is_apart(free, pose, slack):
-    """Whether the object is further than `slack` metres from where anything costs."""
+    """Return whether the object is further than `slack` metres from where anything costs."""
     x, y, z = _centre_in_world(free, pose)
     lower, upper = free.lower, free.upper
     a = x - min(max(x, lower[0]), upper[0])
@@ -140,9 +140,9 @@ def is_apart(free, pose, slack):
 
 @spliced
 def travel(free, pose, memory):
-    """How far in the world any point of the object moved since a pose was remembered, at most.
+    """Return a bound on the motion of the object's points since a pose was remembered, metres.
 
-    As far as its centre, and for a turn D = R - R' by |D| radius; the spectral norm of the
+    The motion of its centre, and for a turn D = R - R' |D| radius; the spectral norm of the
     difference of two rotations is its Frobenius norm over sqrt(2).
     """
     x, y, z = _centre_in_world(free, pose)
@@ -163,14 +163,14 @@ def remember(free, pose, memory):
 
 @leaf
 def _centre_in_world(free, pose):
-    """R^T (c - t)."""
+    """Return R^T (c - t)."""
     x, y, z = free.centre
     return turned_back(pose, x - pose[9], y - pose[10], z - pose[11])
 
 
 @leaf
 def slope(exact, violation):
-    """The violation itself, as the paper defines the gradient, or that of its value."""
+    """Return the violation itself, as the paper defines the gradient, or that of its value."""
     if exact:
         return 1.0 if violation > 0.0 else 0.0
     return violation
@@ -178,7 +178,7 @@ def slope(exact, violation):
 
 @leaf
 def _sums_over(model, pose, move, numbers, count, block):
-    """The sums over the first `count` points by number, block by block."""
+    """Return the sums over the first `count` points by number, block by block."""
     free = model.free
     points = free.tree.points
     for i in range(17):
@@ -222,7 +222,7 @@ def _put(block, first, n, four):
 
 @inner
 def _locate(move, box, level, block, count):
-    """Where the points lie, once moved."""
+    """Fill the rows of a block with the places of moved points."""
     first, last, most, inverse = box.first, box.last, box.most, box.inverse
     for n in range(count):
         x, y, z = block[_POINT + n], block[_POINT + _MOST + n], block[_POINT + 2 * _MOST + n]
@@ -245,7 +245,7 @@ def _locate(move, box, level, block, count):
 
 @inner
 def _weigh_corners(block, count):
-    """How much each corner of its cell counts at each point, as distance_between_nodes has it."""
+    """Fill the weights of cell corners at each point, as distance_between_nodes has them."""
     for n in range(count):
         u, v, w = block[_PLACE + n], block[_PLACE + _MOST + n], block[_PLACE + 2 * _MOST + n]
         a, b, c = 1.0 - u, 1.0 - v, 1.0 - w
@@ -258,7 +258,7 @@ def _weigh_corners(block, count):
 
 @inner
 def _violate_between_nodes(model, block, count):
-    """What each point costs where distances are interpolated, see _put_violation."""
+    """Fill the cost of each point where distances are interpolated, see _put_violation."""
     table, box = model.field.table, model.field.box
     across, along = np.uint64(np.int64(box.across)), np.uint64(np.int64(box.along))
     for n in range(np.uint64(count)):
@@ -273,7 +273,7 @@ def _violate_between_nodes(model, block, count):
 
 @leaf
 def _with_edge(table, node, block, corner, n, read):
-    """What was read so far, plus a node and the next on the third axis, with their weights."""
+    """Return sums so far plus a node and the next on the third axis, with their weights."""
     s, nx, ny, nz = read
     weight = block[np.uint64(_WEIGHT + corner * _MOST) + n]
     a, b, c, d = at_node(table, node)
@@ -285,7 +285,7 @@ def _with_edge(table, node, block, corner, n, read):
 
 @inner
 def _violate_at_nodes(model, block, count):
-    """What each point costs where the nearest node is read, see _put_violation."""
+    """Fill the cost of each point where the nearest node is read, see _put_violation."""
     for n in range(np.uint64(count)):
         cell = np.uint64(np.int64(block[np.uint64(_CELL) + n]))
         _put_violation(model, block, n, cell, at_node(model.field.table, cell))
@@ -293,7 +293,7 @@ def _violate_at_nodes(model, block, count):
 
 @leaf
 def _put_violation(model, block, n, cell, read):
-    """lambda max(0, alpha - s), with gradient -lambda max(0, alpha - s) n (Eq. 8); 0 elsewhere."""
+    """Fill lambda max(0, alpha - s), with gradient -lambda max(0, alpha - s) n (Eq. 8); else 0."""
     scale, exact = model.free_scale, model.exact_gradient
     s, nx, ny, nz = read
     violation = max(block[np.uint64(_LEVEL) + n] - s, 0.0)
@@ -305,7 +305,7 @@ def _put_violation(model, block, n, cell, read):
 
 @inner
 def _read_weights(free, numbers, first, block, count):
-    """Weight, and it times the inward normal, of each point in a free voxel; else 0."""
+    """Fill the weight, and it times the inward normal, of each point in a free voxel; else 0."""
     steps = free.cells.steps
     for n in range(count):
         read = (0.0, 0.0, 0.0, 0.0)
@@ -377,7 +377,7 @@ def _add_violations(block, count):
 
 @leaf
 def _four(block, first, n):
-    """The four numbers of the n-th point."""
+    """Return the four numbers of the n-th point."""
     at = np.uint64(first) + np.uint64(4) * np.uint64(n)
     return (
         block[at],

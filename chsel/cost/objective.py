@@ -54,7 +54,7 @@ def _relaxed_costs_of(model, space, vectors, costs, work):
 
 @spliced
 def cost_and_gradient_of(model, space, vector, gradient, work):
-    """The cost of a search vector (d,); fills its gradient (d,)."""
+    """Return the cost of a search vector (d,); fills its gradient (d,)."""
     put_pose(work.lanes, 0, decode(space, vector))
     evaluate(model, work, 0, 1, SEARCH_SLACK)
     pull_back(space, vector, gradient_of(work.lanes, 0), gradient)
@@ -77,7 +77,7 @@ def costs_and_gradients(model, space, vectors, costs, gradients, first, last, wo
 
 @leaf
 def adam_step(slope, moments, j, powers, rate, epsilon):
-    """The step down a slope along coordinate j; updates moments (2, d).
+    """Return the step down a slope along coordinate j; updates moments (2, d).
 
     powers: beta_1 and beta_2 to the power of the number of steps, this one included.
     """
@@ -134,15 +134,15 @@ class Objective:
         self.space_arrays = space.arrays
 
     def work(self) -> Work:
-        """Scratch for one thread."""
+        """Return scratch for one thread."""
         return work_of(self.model)
 
     def costs(self, vectors: FloatArray) -> FloatArray:
-        """Costs (B,) of vectors (B, d)."""
+        """Return costs (B,) of vectors (B, d)."""
         return self._cost.costs(self.space.poses(vectors))
 
     def costs_and_gradients(self, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Costs (B,) and the defined gradients (B, d) at vectors (B, d)."""
+        """Return costs (B,) and the defined gradients (B, d) at vectors (B, d)."""
         costs, gradients = np.empty(len(vectors)), np.empty(vectors.shape)
         space = self.space_arrays
         run = partial(costs_and_gradients, self.model, space, vectors, costs, gradients)
@@ -152,13 +152,13 @@ class Objective:
     def descended(
         self, vectors: FloatArray, divisor: float, rate: float, iterations: int
     ) -> FloatArray:
-        """Vectors (B, d) after some iterations of Adam; gradients are divided by `divisor`."""
+        """Return vectors (B, d) after iterations of Adam; gradients are divided by `divisor`."""
         return self._descended(vectors, divisor, rate, iterations, ends_on_poses=False)[0]
 
     def block(
         self, vectors: FloatArray, divisor: float, rate: float, iterations: int
     ) -> tuple[FloatArray, FloatArray]:
-        """The same, as vectors of poses again, with their costs (B,)."""
+        """Return vectors (B, d) of poses after a block of iterations, and costs (B,)."""
         if not self.space_arrays.planar:
             return self._descended(vectors, divisor, rate, iterations, ends_on_poses=True)
         moved = self.descended(vectors, divisor, rate, iterations)

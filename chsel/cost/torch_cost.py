@@ -58,16 +58,16 @@ class RelaxedCost:
 
     @classmethod
     def of(cls, problem: RegistrationProblem, settings: CostSettings | None = None) -> RelaxedCost:
-        """The cost that a problem's points define."""
+        """Return the cost that a problem's points define."""
         return cls(problem.sdf, problem.points, settings, free_resolution=problem.free_resolution)
 
     def __call__(self, rotation: Tensor, translation: Tensor) -> Tensor:
-        """Costs (B,) of object_from_world rotations (B, 3, 3) and translations (B, 3)."""
+        """Return costs (B,) of object_from_world rotations (B, 3, 3) and translations (B, 3)."""
         poses = zip(rotation.split(1), translation.split(1), strict=True)
         return torch.cat([translation[:0, 0], *(self._cost(*pose) for pose in poses)])
 
     def evaluate(self, object_from_world: FloatArray) -> FloatArray:
-        """Costs (B,) of transforms (B, 4, 4); infinite for one that is not finite."""
+        """Return costs (B,) of transforms (B, 4, 4); infinite for one that is not finite."""
         transforms = stacked(object_from_world)
         with torch.no_grad():
             costs = self(_tensor(transforms[:, :3, :3]), _tensor(transforms[:, :3, 3])).numpy()
@@ -75,7 +75,7 @@ class RelaxedCost:
         return np.asarray(costs)
 
     def _cost(self, rotation: Tensor, translation: Tensor) -> Tensor:
-        """The same, of one pose."""
+        """Return the cost of one pose."""
         settings, pose = self.settings, (rotation, translation)
         x, s, n = self._read(*pose, self._known)
         difference = s - self._known_sdf  # sum |s - v|, with gradient (s - v) n (Eq. 10)
@@ -89,7 +89,7 @@ class RelaxedCost:
         )
 
     def _near(self, rotation: Tensor, translation: Tensor) -> Tensor:
-        """The free points (N', 3) that may cost something at a pose."""
+        """Return the free points (N', 3) that may cost something at a pose."""
         with torch.no_grad():
             x = _moved(rotation[:, None], translation[:, None], self._free)
         return self._free[((x >= self._deep[0]) & (x <= self._deep[1])).all(dim=2).any(dim=0)]
@@ -97,7 +97,7 @@ class RelaxedCost:
     def _violation(
         self, rotation: Tensor, translation: Tensor, points: Tensor, sign: float
     ) -> Tensor:
-        """sum max(0, alpha -+ s), with gradient -+ max(0, alpha -+ s) n (Eqs. 8 and 9)."""
+        """Return sum max(0, alpha -+ s), with gradient -+ max(0, alpha -+ s) n (Eqs. 8 and 9)."""
         x, s, n = self._read(rotation, translation, points)
         violation = (self.settings.alpha + sign * s).clamp_min(0.0)
         return self._sum(violation, torch.full_like(s, sign), x, n)
@@ -105,20 +105,20 @@ class RelaxedCost:
     def _read(
         self, rotation: Tensor, translation: Tensor, points: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Moved points (B, N, 3), their signed distances (B, N) and gradients (B, N, 3)."""
+        """Return moved points (B, N, 3), their signed distances (B, N) and gradients (B, N, 3)."""
         x = _moved(rotation[:, None], translation[:, None], points)
         settings, at = self.settings, x.detach().numpy().reshape(-1, 3)
         s, n = self.sdf.at(at, lookup=settings.lookup, outside=settings.outside)
         return x, _tensor(s).reshape(x.shape[:2]), _tensor(n).reshape(x.shape)
 
     def _sum(self, violation: Tensor, side: Tensor, x: Tensor, n: Tensor) -> Tensor:
-        """The sums (B,) of violations (B, N) to a side, with the gradient that is asked for."""
+        """Return sums (B,) of violations (B, N) to a side, with the gradient of the settings."""
         is_exact = self.settings.gradient == "exact"
         slope = (violation > 0.0).double() if is_exact else violation
         return _with_gradient(violation, (slope * side)[..., None] * n, x).sum(dim=1)
 
     def _interior(self, rotation: Tensor, translation: Tensor) -> Tensor:
-        """The free term over points inside the object: lambda sum_j o_j w_j.
+        """Return the free term over points inside the object: lambda sum_j o_j w_j.
 
         w_j = -s(m_j) for interior points m_j, o_j = 1 where m_j lies in a known free voxel. The
         gradient by the world point y_j is lambda o_j w_j R^T n_j: inwards, out of the free voxel.
@@ -139,12 +139,12 @@ def _tensor(array: FloatArray) -> Tensor:
 
 
 def _moved(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
-    """R x + t (..., 3), without a matrix product, whose order of additions may differ."""
+    """Return R x + t (..., 3), without a matrix product, whose order of additions may differ."""
     columns = [rotation[..., i] * points[..., i, None] for i in range(3)]
     return columns[0] + columns[1] + columns[2] + translation
 
 
 def _with_gradient(values: Tensor, gradients: Tensor, points: Tensor) -> Tensor:
-    """Values (..., P), with given gradients (..., P, 3) by points (..., P, 3)."""
+    """Return values (..., P), with given gradients (..., P, 3) by points (..., P, 3)."""
     moves = gradients.detach() * (points - points.detach())  # zero, but not their derivative
     return values.detach() + moves.sum(dim=-1)

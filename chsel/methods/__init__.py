@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from chsel.errors import require_choice, require_instance
-from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
+from chsel.methods.anchored.anchored import Anchored
+from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.methods.chsel import Chsel, ChselSettings
 from chsel.methods.cvo import Cvo, CvoSettings
 from chsel.methods.gradient_descent import GradientDescent, GradientDescentSettings
@@ -40,7 +41,7 @@ MOST_NOISE = 0.25  # of points, in diameters of the object: more is in millimetr
 
 
 def _lacks(method: Any) -> str | None:
-    """What an object with settings lacks to be a method, and what is accepted."""
+    """Return why an object with settings is not a method, and what is; None if it is one."""
     if not isinstance(getattr(method, "online", None), OnlineSettings):
         return "no `online`; accepted: a property that returns OnlineSettings"
     if not callable(getattr(method, "register", None)):
@@ -56,7 +57,7 @@ build_method, preset_settings = _CHOICES.build, _CHOICES.settings
 
 
 def default_method(preset: str = "default") -> str:
-    """The method for points of one's own; of presets that are the paper's, the paper's method."""
+    """Return the method for a program's points; in the paper's presets the paper's method."""
     require_choice("preset", preset, PRESETS)
     return "anchored" if preset == "default" else "chsel"
 

@@ -17,6 +17,7 @@ from chsel.cost.cost_settings import uncertain_depth
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import bounds_of, set_voxels
 from chsel.numerics.compiler import compiled, inner, leaf
+from chsel.numerics.elementary import sines_cosines_of_turns
 from chsel.numerics.pose_tuples import moved, origin_within, pose_at, turned
 from chsel.numerics.threads import parallel_for
 from chsel.problem.points import KnownPoints
@@ -55,12 +56,11 @@ _MOST_COST = 2**30  # of all points inside, so that no sum overflows
 _MOST_VOXELS = 20_000_000  # of free space: bytes
 _FAR = np.float32(0.6)  # from an axis: more than 1 / sqrt(3), so that any direction is far from one
 _SHORTEST_SQUARED = np.float32(1e-9)  # of vectors that give a direction
-_SIGNS = np.array([1, 1, -1, -1, 1, 1], dtype=np.float32)  # of sines in quarters of a turn
 
 
 @dataclass(frozen=True)
 class AnchorSettings(CheckedSettings):
-    """How poses are drawn: on pairs of contacts, on single ones, or uniform in the workspace."""
+    """Shares of poses drawn on pairs of contacts, on single ones, and uniform in the workspace."""
 
     pairs: Annotated[float, not_negative] = 0.5  # share with two surface points on a pair's line
     contacts: Annotated[float, not_negative] = 0.4  # share with one surface point on a contact
@@ -69,17 +69,17 @@ class AnchorSettings(CheckedSettings):
 
 @dataclass(frozen=True)
 class AnchoredStarts(CheckedSettings):
-    """How many poses on contacts CHSEL descends from, beside E_0."""
+    """The number of poses on contacts that CHSEL descends from, beside E_0."""
 
     samples: Annotated[int, positive, at_most(_MOST_SAMPLES)] = 20_000  # poses that are drawn
     kept: Annotated[int, positive, at_most(_MOST_KEPT)] = 60  # those of them that score best
-    anchors: AnchorSettings = field(default_factory=AnchorSettings)
+    anchors: AnchorSettings = field(default_factory=AnchorSettings)  # where they are drawn
 
 
 def anchored_starts(
     problem: RegistrationProblem, space: SearchSpace, settings: AnchoredStarts, index: int
 ) -> Poses:
-    """K poses, best first; none of an object too thin to have a surface on its grid.
+    """Return K poses, best first; none of an object too thin to have a surface on its grid.
 
     index: of the pass, each of which draws its own.
     """
@@ -91,7 +91,7 @@ def anchored_starts(
 
 
 def most_informative_first(points: KnownPoints) -> KnownPoints:
-    """The points, with known ones in the order of farthest points.
+    """Return the points, with known ones in the order of farthest points.
 
     So sums over them rule out poses that do not fit after a few.
     """
@@ -153,7 +153,7 @@ class AnchorSampler:
     def best(
         self, samples: int, most: int, *, index: int = 0, tolerance: float = 0.0, left_out: int = 0
     ) -> Poses:
-        """The best of so many random poses by their coarse score: K poses, best first.
+        """Return the best of so many random poses by their coarse score: K poses, best first.
 
         The score is the mean distance of contacts, and depths of points inside in free space. Of
         equal scores the first is better, so that the result does not depend on threads.
@@ -182,7 +182,7 @@ class AnchorSampler:
     def _best_keys(
         self, score: CoarseScore, shares: Any, first: int, ends: IntArray, keys: IntArray, most: int
     ) -> IntArray:
-        """Keys of the best, in ascending order, of those before and poses numbered from `first`."""
+        """Return the best keys, ascending, of those before and of poses from `first` on."""
         heaps: list[IntArray] = []
         worst_first = np.concatenate([np.full(most - len(keys), NO_POSE), keys[::-1]])
 
@@ -198,17 +198,17 @@ class AnchorSampler:
                 keep_best(score, self._placed(shares[:, part], numbers, ends), first + at, heap)
 
         parallel_for(run, shares.shape[1], scratch, least=_SAMPLES_PER_THREAD)
-        found = np.unique(np.concatenate(heaps))
-        return found[found < NO_POSE][:most]
+        merged = np.unique(np.concatenate(heaps))
+        return merged[merged < NO_POSE][:most]
 
     def _placed(self, shares: Any, numbers: IntArray, ends: IntArray) -> Any:
-        """Poses (N, 12) from their shares (_SHARES, N), and numbers (N,) in ascending order."""
+        """Return poses (N, 12) from their shares (_SHARES, N) and numbers (N,), which ascend."""
         pairs, singles, others = np.split(shares, np.searchsorted(numbers, ends), axis=1)
         parts = self._on_pairs(pairs), self._on_contacts(singles), self._anywhere(others)
         return np.concatenate(parts, axis=1).T
 
     def _on_pairs(self, shares: Any) -> Any:
-        """Poses that put two surface points onto the line of two contacts, turned about it.
+        """Return poses that put two surface points onto the line of two contacts, turned about it.
 
         R = G^T F, with the frames' vectors as rows.
         """
@@ -221,14 +221,14 @@ class AnchorSampler:
         none = np.zeros_like(x)  # the cross product with an axis that the line is far from
         a, b, c = across = _unit(np.where(np.abs(x) < _FAR, [none, -z, y], [z, none, -x]))
         other = np.array([y * c - z * b, z * a - x * c, x * b - y * a])
-        sine, cosine = _sines_cosines(shares[3])
+        sine, cosine = sines_cosines_of_turns(shares[3])
         turned = np.array([along, cosine * across + sine * other, cosine * other - sine * across])
         frame = self._frames.take(pair, axis=1)
         rotation = product(turned.T, frame[:9].reshape(3, 3, -1).transpose(2, 0, 1))
         return self._poses(rotation, frame[9:], _HALF * (p + q))
 
     def _on_contacts(self, shares: Any) -> Any:
-        """Poses that put a surface point onto a contact, or one at its distance."""
+        """Return poses that put a surface point onto a contact, or one at its distance."""
         contact = _chosen(shares[0], len(self._values))
         first, count = self._contact_spans.take(contact, axis=1)
         at = self._surface_order[first + _chosen(shares[1], count)]
@@ -237,25 +237,25 @@ class AnchorSampler:
         return self._poses(self._rotations(shares), self._contacts.take(contact, axis=1), met)
 
     def _anywhere(self, shares: Any) -> Any:
-        """Poses that put the object's origin anywhere in its bounds."""
+        """Return poses that put the object's origin anywhere in its bounds."""
         origins = self._lower[:, None] + shares[:3] * (self._upper - self._lower)[:, None]
         return self._poses(self._rotations(shares), origins, np.zeros_like(origins))
 
     def _rotations(self, shares: Any) -> Any:
-        """Rotations (N, 3, 3) about the plane's axis, or uniform on SO(3) (Shoemake, 1992)."""
-        s, c = _sines_cosines(shares[3])
+        """Return rotations (N, 3, 3) about the plane's axis, or uniform (Shoemake, 1992)."""
+        s, c = sines_cosines_of_turns(shares[3])
         if isinstance(self._space, SE2Space):  # Rodrigues' formula
             arrays = self._space.arrays
             rows = [arrays.resting, arrays.turning, arrays.turning_squared]
             resting, turning, squared = _in_32_bits(np.array(rows))[..., None]
             rotations = resting + s * turning + (1 - c) * squared
             return rotations.reshape(3, 3, -1).transpose(2, 0, 1)
-        sine, cosine = _sines_cosines(shares[4])
+        sine, cosine = sines_cosines_of_turns(shares[4])
         small, large = np.sqrt(1 - shares[5]), np.sqrt(shares[5])
         return rotation_matrices(np.array([small * c, large * sine, large * cosine, small * s]).T)
 
     def _poses(self, rotation: Any, points: Any, onto: Any) -> Any:
-        """Poses (12, N) that move points (3, N) onto points of the object: t = q - R p."""
+        """Return poses (12, N) that move points (3, N) onto points of the object: t = q - R p."""
         shift = onto - rotated(rotation, points.T).T
         space = self._space
         if isinstance(space, SE2Space):  # along the plane's axis until a . t = o
@@ -266,7 +266,7 @@ class AnchorSampler:
         return np.concatenate([rotation.transpose(1, 2, 0).reshape(9, -1), shift])
 
     def _exact(self, numbers: FloatArray) -> Poses:
-        """Poses in the world from those (K, 12) in 32 bits around its middle."""
+        """Return poses in the world from those (K, 12) in 32 bits around its middle."""
         rigid = SE3Space()
         turned = rigid.poses(rigid.encode(Poses(numbers)))
         shift = turned.translations - rotated(turned.rotations, self._middle)
@@ -299,27 +299,14 @@ class AnchorSampler:
 
 
 def _chosen(shares: Any, sizes: Any) -> IntArray:
-    """Which of so many things shares from 0 to 1 choose."""
+    """Return indices (N,) that shares (N,) from 0 to 1 choose of so many things."""
     return np.minimum((shares * np.float32(sizes)).astype(np.int64), np.subtract(sizes, 1))
 
 
 def _unit(vectors: Any) -> Any:
-    """Vectors (3, N) of length 1."""
+    """Return vectors (3, N) of length 1."""
     x, y, z = vectors
     return vectors * (1.0 / np.sqrt(np.maximum(x * x + y * y + z * z, _SHORTEST_SQUARED)))
-
-
-def _sines_cosines(shares: Any) -> tuple[Any, Any]:
-    """Sines and cosines of shares of a turn, to about seven digits (Taylor)."""
-    quarters = 4 * shares
-    nearest = (quarters + _HALF).astype(np.int32)
-    r = (quarters - nearest.astype(np.float32)) * np.float32(0.5 * np.pi)
-    z = r * r
-    sine = r + r * z * ((-1 / 5040 * z + 1 / 120) * z - 1 / 6)
-    cosine = 1 + z * (((1 / 40320 * z - 1 / 720) * z + 1 / 24) * z - 1 / 2)
-    odd = (nearest & 1).astype(np.bool_)
-    a, b = np.where(odd, cosine, sine), np.where(odd, sine, cosine)
-    return a * _SIGNS.take(nearest), b * _SIGNS.take(nearest + 1)
 
 
 def _in_32_bits(values: Any) -> Any:
@@ -327,12 +314,12 @@ def _in_32_bits(values: Any) -> Any:
 
 
 def _in_units(metres: FloatArray) -> Any:
-    """Distances in UNITs, flat, 16 bits."""
+    """Return distances in UNITs, flat, 16 bits."""
     return np.clip(np.rint(metres / UNIT), -32767, 32767).astype(np.int16).reshape(-1)
 
 
 def _box(first: FloatArray, resolution: float, shape: Sequence[int]) -> Box32:
-    """The box of a grid of nodes (nx, ny, nz) whose first node is at `first` (3,)."""
+    """Return the box of a grid of nodes (nx, ny, nz) whose first node is at `first` (3,)."""
     x, y, z = _in_32_bits(first)
     a, b, c = (np.float32(count - 1) for count in shape)
     inverse, (_, along, last) = np.float32(1.0 / resolution), shape
@@ -340,7 +327,7 @@ def _box(first: FloatArray, resolution: float, shape: Sequence[int]) -> Box32:
 
 
 def _inside(sdf: SdfGrid, tolerance: float) -> tuple[FloatArray, FloatArray]:
-    """Points (P, 3) inside of the object, the deepest first, and costs (P,) of them all, metres."""
+    """Return points (P, 3) inside of the object, the deepest first, and costs (P,), metres."""
     deep = np.argwhere(sdf.values <= _DEEP * min(float(sdf.values.min()), 0.0))
     if len(deep) > _MOST_NODES:
         deep = deep[np.arange(_MOST_NODES) * len(deep) // _MOST_NODES]
@@ -353,7 +340,7 @@ def _inside(sdf: SdfGrid, tolerance: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _free_voxels(problem: RegistrationProblem, reach: float) -> tuple[FloatArray, Any]:
-    """Centre (3,) of the first voxel, and which (nx, ny, nz) have a free point within `reach`."""
+    """Return the centre (3,) of the first voxel, and flags (nx, ny, nz) of free voxels."""
     free, side = problem.points.free, problem.free_resolution
     lower, upper = problem.workspace.bounds
     free = free[((free >= lower - reach) & (free <= upper + reach)).all(axis=1)]
@@ -368,7 +355,7 @@ def _free_voxels(problem: RegistrationProblem, reach: float) -> tuple[FloatArray
 
 
 def _frames(pairs: FloatArray) -> FloatArray:
-    """Of pairs of points (C, 2, 3): a frame along their line, row by row, then their middle."""
+    """Return frames (C, 12) of pairs of points (C, 2, 3): axes, the first along, then middle."""
     along = pairs[:, 1] - pairs[:, 0]
     along = along / np.sqrt((along**2).sum(axis=1, keepdims=True))
     axis = np.eye(3)[np.argmin(np.abs(along), axis=1)]
@@ -379,7 +366,7 @@ def _frames(pairs: FloatArray) -> FloatArray:
 
 
 def _surface_pairs(sdf: SdfGrid) -> tuple[FloatArray, FloatArray, FloatArray, Any]:
-    """Surface points and normals (Q, 3), and pairs (2 P,) of them in the order of lengths (P,)."""
+    """Return surface points and normals (Q, 3), pairs (2 P,) of them, and their lengths (P,)."""
     stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
     surface = surface_points(sdf, _SURFACE_POINTS, stream)
     normals = sdf.at(surface, lookup="trilinear")[1]
@@ -394,7 +381,7 @@ def _surface_pairs(sdf: SdfGrid) -> tuple[FloatArray, FloatArray, FloatArray, An
 def _pairs_of_contacts(
     contacts: FloatArray, values: FloatArray, lengths: FloatArray
 ) -> tuple[IntArray, IntArray]:
-    """Pairs of contacts (C, 2), and the spans (C, 2) of surface pairs of their length."""
+    """Return pairs of contacts (C, 2), and the spans (C, 2) of surface pairs of their length."""
     touching = np.flatnonzero(values == 0.0)
     pairs = touching[np.stack(np.triu_indices(len(touching), 1), axis=1)]
     apart = np.sqrt(((contacts[pairs[:, 0]] - contacts[pairs[:, 1]]) ** 2).sum(axis=1))
@@ -404,7 +391,7 @@ def _pairs_of_contacts(
 
 
 def _spans(ascending: FloatArray, wanted: FloatArray, reach: FloatArray | float) -> IntArray:
-    """First, and how many (N, 2) of the ascending values are near to wanted ones (N,)."""
+    """Return first, and how many (N, 2) of the ascending values are near to wanted ones (N,)."""
     first = np.searchsorted(ascending, wanted - reach)
     last = np.searchsorted(ascending, wanted + reach, side="right")
     return np.stack([first, last - first], axis=1)
@@ -421,7 +408,7 @@ class Box32(NamedTuple):
 
 
 class CoarseScore(NamedTuple):
-    """What poses are scored by: some known points, and points inside of the object."""
+    """Data of the coarse score: some known points, and points inside of the object."""
 
     lower: Any  # (3,), where the object's origin may be
     upper: Any  # (3,)
@@ -433,7 +420,7 @@ class CoarseScore(NamedTuple):
     left_out: int  # contacts that cost the most and do not count: 0 or 1
     inside: Any  # (P, 3), object frame
     weights: Any  # (P,), cost of each in free space, in UNITs of the sum over contacts
-    voxels: Box32
+    voxels: Box32  # of free space, world
     is_free: Any  # (voxels,)
 
 
@@ -486,7 +473,7 @@ def _locate(grid, pose, contacts, nodes, beyond):
 
 @leaf
 def _coarse_score(score, pose, nodes, beyond, limit):
-    """The score of a pose, or a part of it if it is above the limit."""
+    """Return the score of a pose, or a part of it if it is above the limit."""
     total, worst = np.int64(0), np.int64(0)
     for n in range(len(nodes)):
         off = np.float32(score.values[nodes[n]]) + (beyond[n] - score.known_sdf[n])
@@ -506,7 +493,7 @@ def _coarse_score(score, pose, nodes, beyond, limit):
 
 @leaf
 def _voxels_from_object(box, pose):
-    """R^T and -R^T t in steps of a box, as a pose."""
+    """Return R^T and -R^T t in steps of a box, as a pose."""
     scale = box.inverse
     a, b, c = pose[0] * scale, pose[3] * scale, pose[6] * scale
     d, e, f = pose[1] * scale, pose[4] * scale, pose[7] * scale
@@ -523,6 +510,6 @@ def _clipped(x, most):
 
 @leaf
 def _node(box, x, y, z):
-    """Where the node nearest to a place in a box is in a flat array."""
+    """Return the index in a flat array of the node nearest to a point of a box."""
     across = np.int32(x + _HALF) * box.across + np.int32(y + _HALF) * box.along
     return np.uint32(across + np.int32(z + _HALF))  # not counted from the end

@@ -41,15 +41,16 @@ _EMITTER = EmitterSettings(iterations=30)
 
 @dataclass(frozen=True)
 class ChselSettings(CheckedSettings):
-    """All settings of CHSEL."""
+    """Settings of CHSEL."""
 
-    search: Annotated[str, one_of(*SEARCHES)] = "cma_mega"
+    search: Annotated[str, one_of(*SEARCHES)] = "cma_mega"  # emitter of lines 5 and 6
     passes: Annotated[int, positive, at_most(MOST_PASSES)] = 1  # each around the best of the last
-    cost: CostSettings = field(default_factory=CostSettings)
-    descent: DescentSettings = _DESCENT
-    archive: ArchiveSettings = field(default_factory=ArchiveSettings)
-    emitter: EmitterSettings = _EMITTER
-    output: OutputSettings = field(default_factory=OutputSettings)
+    cost: CostSettings = field(default_factory=CostSettings)  # the relaxed cost
+    descent: DescentSettings = _DESCENT  # of line 1
+    archive: ArchiveSettings = field(default_factory=ArchiveSettings)  # of lines 2 and 3
+    emitter: EmitterSettings = _EMITTER  # of lines 4 to 6
+    output: OutputSettings = field(default_factory=OutputSettings)  # of line 7
+    # E_0 and E_l of the next problem.
     online: OnlineSettings = field(default_factory=OnlineSettings)
     starts: AnchoredStarts | None = field(default_factory=AnchoredStarts)  # beside E_0
     plane: PlaneSettings | None = None  # restricts the poses to SE(2)
@@ -95,7 +96,7 @@ class _Algorithm1:
         self.measure = measure_named(settings.archive.measure, planar=settings.plane is not None)
 
     def run(self, initial_set: Poses, low_cost_set: Poses, index: int) -> Hypotheses:
-        """Hypotheses from E_0 and E_l, line by line."""
+        """Return hypotheses from E_0 and E_l, line by line."""
         objective, space, measure = self.objective, self.space, self.measure
         settings, known_count = self.settings.archive, len(self.problem.points.known)
         # 1: E' <- SGD on E_0 with C^
@@ -113,7 +114,7 @@ class _Algorithm1:
         return self.lowest_cost_cells(archive, index)
 
     def sgd(self, initial_set: Poses, index: int) -> tuple[FloatArray, FloatArray]:
-        """Line 1, on further starts too if there are any: vectors (B, d) and costs (B,)."""
+        """Return line 1, on further starts too if there are any: vectors (B, d) and costs (B,)."""
         settings, starts = self.settings, initial_set
         if settings.starts is not None:
             anchored = anchored_starts(self.problem, self.space, settings.starts, index)
@@ -123,7 +124,7 @@ class _Algorithm1:
         return self.space.encode(estimates[inside]), costs[inside]
 
     def cma_mega(self, archive: GridArchive, initial_set: Poses, index: int) -> None:
-        """Line 6, or CMA-ME in its place."""
+        """Run line 6, or CMA-ME in its place."""
         settings, start = self.settings.emitter, archive.best_solution
         if settings.start == "initial":
             start = self.space.encode(initial_set[:1])[0]
@@ -132,7 +133,7 @@ class _Algorithm1:
         fill_archive(*search, key, self.observer, index)
 
     def lowest_cost_cells(self, archive: GridArchive, index: int) -> Hypotheses:
-        """Line 7."""
+        """Return line 7."""
         problem, space, output = self.problem, self.space, self.settings.output
         last = archive.snapshot(self.settings.emitter.iterations, index)
         elites = space.poses(last.solutions)
@@ -142,11 +143,11 @@ class _Algorithm1:
         return ranked_hypotheses(self.objective, elites[chosen], last.cells[chosen], kept, last)
 
     def within_workspace(self, poses: Poses) -> BoolArray:
-        """True (B,) for the poses to keep."""
+        """Return True (B,) for the poses to keep."""
         return within_workspace(poses, self.problem, self.space, self.settings.output.margin)
 
     def resampled_around_best(self, estimates: Hypotheses, index: int) -> Poses:
-        """E_0 of a further pass, drawn around the best fifth of B estimates.
+        """Return E_0 of a further pass, drawn around the best fifth of B estimates.
 
         By mean and deviation (ddof 1) of each coordinate of the search vectors; the best fifth
         itself comes first, unchanged.

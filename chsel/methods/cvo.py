@@ -52,31 +52,32 @@ _ON_LATTICE = 1e-6  # spacings that a point may be away from a node
 
 @dataclass(frozen=True)
 class CvoSettings(CheckedSettings):
-    """All settings of CVO; names as in the authors' parameter file."""
+    """Settings of CVO; names as in the authors' parameter file."""
 
     free_space: bool = True  # use free points; else contacts and the object's surface alone
     balanced: bool = False  # weigh contacts by the number of free points per contact
     # Length scale of the kernel, metres. After an ascent it is multiplied by ell_decay and another
     # ascent follows, as long as it is above ell_min.
     ell: Annotated[float, positive, between(FINEST, COARSEST)] = 0.1
-    ell_min: Annotated[float, positive, between(FINEST, COARSEST)] = 0.025
-    ell_decay: Annotated[float, positive, at_most(0.99)] = 0.5
+    ell_min: Annotated[float, positive, between(FINEST, COARSEST)] = 0.025  # the least, metres
+    ell_decay: Annotated[float, positive, at_most(0.99)] = 0.5  # factor
     # Nodes of the SDF within it of the surface make the object's surface, those farther outside its
     # free space, metres; null: the SDF's resolution (r_t).
     surface_band: Annotated[float | None, positive] = None
     # Divisors of the rotational and the translational part of the flow, so that a turn by 1 rad
     # counts as a shift by sqrt(c / d) m.
     c: Annotated[float, positive] = 0.07
-    d: Annotated[float, positive] = 7.0
+    d: Annotated[float, positive] = 7.0  # of translation
     # The flow turns about the workspace's centre, or the "world" origin as published.
     origin: Annotated[str, one_of("world", "workspace")] = "workspace"
     max_iterations: Annotated[int, positive, at_most(MOST_ITERATIONS)] = 100  # of an ascent
-    min_step: Annotated[float, positive] = 1e-4  # the least and
-    # the greatest length of a step that is tried first
+    min_step: Annotated[float, positive] = 1e-4  # least length of a step that is tried first
+    # Greatest length of a step that is tried first.
     max_step: Annotated[float, positive, at_most(1.0)] = 0.8
     # A start ends when its inner product grew by no more than this fraction in 5 iterations in a
     # row; null: never.
     stop_below: Annotated[float | None, not_negative] = 1e-5
+    # E_0 and E_l of the next problem.
     online: OnlineSettings = field(default_factory=OnlineSettings)
 
     _AUTHORS: ClassVar = {"ell_min": 0.1, "c": 7.0, "origin": "world", "stop_below": None}
@@ -131,7 +132,7 @@ class Cvo(ConfiguredMethod[CvoSettings]):
         return ranked(estimates.matrices, _costs(climbers.value, norm))
 
     def _clouds(self, problem: RegistrationProblem, kernel: Kernel) -> tuple[Product, float]:
-        """F, and |f_x| |f_z|."""
+        """Return F, and |f_x| |f_z|."""
         sdf, lattice, contacts = problem.sdf, problem.free_resolution, problem.points.contacts
         band = self.settings.surface_band or sdf.resolution
         free = problem.points.free if self.settings.free_space else np.zeros((0, 3))
@@ -152,12 +153,12 @@ class Cvo(ConfiguredMethod[CvoSettings]):
 
 
 def _costs(values: FloatArray, norm: float) -> FloatArray:
-    """1 - F / (|f_x| |f_z|), in [0, 1] but for the field's interpolation."""
+    """Return 1 - F / (|f_x| |f_z|), in [0, 1] but for the field's interpolation."""
     return 1.0 - values / norm if norm > 0.0 else np.ones(len(values))
 
 
 class Ascent(NamedTuple):
-    """How to climb."""
+    """Settings of the ascent as kernels take them."""
 
     least: float  # and
     most: float  # tau of a step that is tried first
@@ -178,7 +179,7 @@ class Climbers(NamedTuple):
 
 
 def climbers_at(product: Product, poses: FloatArray) -> Climbers:
-    """Climbers at copies of poses (B, 12), before the first step."""
+    """Return climbers at copies of poses (B, 12), before the first step."""
     value, step = values_of(product, poses), np.zeros(len(poses))
     stalled, done = np.zeros(len(poses), dtype=np.int64), np.zeros(len(poses), dtype=bool)
     return Climbers(poses.copy(), value, step, stalled, done)
@@ -198,7 +199,7 @@ def climb(product, ascent, climbers, iterations, first, last, _):
 
 @inner
 def _direction(product, ascent, pose):
-    """The unit flow (1/c sum x_i x h_i, 1/d sum h_i) about the world's origin, and F's slope."""
+    """Return the unit flow (1/c sum x_i x h_i, 1/d sum h_i) about the origin, and F's slope."""
     flow = flow_at(product, pose, ascent.centre)
     a, b, c = flow[1] / ascent.c, flow[2] / ascent.c, flow[3] / ascent.c
     d, e, f = flow[4] / ascent.d, flow[5] / ascent.d, flow[6] / ascent.d
@@ -254,14 +255,14 @@ def _step(product, ascent, pose, xi, slope, climbers, n):
 
 @leaf
 def _vertex(tau, gain, slope):
-    """Where a parabola of that slope at 0 and that gain at tau is highest; infinite if nowhere."""
+    """Return the top of the parabola of that slope at 0 and that gain at tau; infinite if none."""
     bend = (gain / tau - slope) / tau
     return -0.5 * slope / bend if bend < 0.0 else np.inf
 
 
 @leaf
 def _crest(tau, gain, other, other_gain, slope):
-    """Where a cubic of that slope at 0 and those gains is highest nearby; infinite if nowhere."""
+    """Return the nearest top of the cubic of that slope at 0 and those gains; infinite if none."""
     near, far = (gain / tau - slope) / tau, (other_gain / other - slope) / other
     third = (far - near) / (other - tau)
     second = near - third * tau
@@ -272,7 +273,7 @@ def _crest(tau, gain, other, other_gain, slope):
 
 @leaf
 def _moved_along(pose, xi, tau):
-    """G Exp(tau xi) of a pose G and a flow xi = (omega, u), by the exponential map of SE(3)."""
+    """Return G Exp(tau xi) of a pose G and a flow xi = (omega, u)."""
     size = np.sqrt(xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2])
     angle = tau * size
     inverse = 1.0 / size if size > 0.0 else 0.0
@@ -300,7 +301,7 @@ def _moved_along(pose, xi, tau):
 
 @inner
 def flow_at(product, pose, centre):
-    """F, sum x_i x h_i and sum h_i with h_i = R^T grad f(R x_i + t), x_i from the centre."""
+    """Return F, sum x_i x h_i and sum h_i with h_i = R^T grad f(R x_i + t), x_i from the centre."""
     value = x = y = z = p = q = r = 0.0
     for term in product:
         points, box, m = term.points, term.field.box, term.weight
@@ -324,8 +325,8 @@ def flow_at(product, pose, centre):
 class Kernel:
     """k(x, z) = amplitude exp(-|x - z|^2 / (2 ell^2)), metres."""
 
-    ell: float
-    amplitude: float = 1.0
+    ell: float  # metres
+    amplitude: float = 1.0  # k(x, x)
 
     def reach(self, spacing: float, stride: int = 1) -> int:
         """K: how many nodes it reaches, a multiple of the stride."""
@@ -335,7 +336,7 @@ class Kernel:
 class ClassField(NamedTuple):
     """f of one class of a cloud in the object frame."""
 
-    box: Box
+    box: Box  # of its nodes
     table: Any  # (4 nodes,), f and its gradient at each node of the box; float32
     norm: float  # <f, f>
 
@@ -344,7 +345,7 @@ class ClassTerm(NamedTuple):
     """One class of points and its field."""
 
     points: FloatArray  # (3, N), world, metres
-    field: ClassField
+    field: ClassField  # f of the class
     weight: float = 1.0  # W of the class
 
 
@@ -352,7 +353,7 @@ Product = tuple[ClassTerm, ...]  # F(X) = sum over classes of W sum_i f(R x_i + 
 
 
 def values_of(product: Product, poses: FloatArray) -> FloatArray:
-    """F (B,) at poses (B, 12)."""
+    """Return F (B,) at poses (B, 12)."""
     out = np.empty(len(poses))
     parallel_for(partial(_fill_values, product, poses, out), len(poses), lambda: None)
     return out
@@ -366,7 +367,7 @@ def _fill_values(product, poses, out, first, last, _):
 
 @inner
 def product_at(product, pose):
-    """F at a pose."""
+    """Return F at a pose."""
     total = 0.0
     for term in product:
         points, value = term.points, 0.0
@@ -380,7 +381,7 @@ def product_at(product, pose):
 
 
 def class_field(sdf: SdfGrid, kernel: Kernel, band: float, name: str) -> ClassField:
-    """Of nodes of a grid: "surface" within `band` metres of it, "free" more than that outside."""
+    """Return nodes of a grid by class: "surface" within `band` metres of it, "free" beyond."""
 
     def make() -> ClassField:
         members = np.abs(sdf.values) <= band if name == "surface" else sdf.values > band
@@ -405,7 +406,7 @@ def class_field(sdf: SdfGrid, kernel: Kernel, band: float, name: str) -> ClassFi
 
 
 def cloud_norm(points: FloatArray, kernel: Kernel, lattice: float) -> float:
-    """<f, f> of a cloud (N, 3): the sum over all pairs.
+    """Return <f, f> of a cloud (N, 3): the sum over all pairs.
 
     Of many points on a lattice of that spacing, metres, over a grid, unless that is too large.
     """
@@ -423,7 +424,7 @@ def cloud_norm(points: FloatArray, kernel: Kernel, lattice: float) -> float:
 
 @compiled
 def _sum_of_pairs(points, ell):
-    """Sum over pairs of points (N, 3) of exp(-|x - y|^2 / (2 ell^2))."""
+    """Return sum over pairs of points (N, 3) of exp(-|x - y|^2 / (2 ell^2))."""
     total, radius = 0.0, _FAR * ell
     for i in range(len(points)):
         total += 1.0
@@ -437,7 +438,7 @@ def _sum_of_pairs(points, ell):
 
 
 def _nodes_of(points: FloatArray, lattice: float) -> FloatArray | None:
-    """Indices (N, 3) of lattice nodes from the first on; None of few points, or elsewhere."""
+    """Return indices (N, 3) of lattice nodes from the first on; None if few, or off the lattice."""
     if len(points) <= _FEW:
         return None
     steps = (points - points.min(axis=0)) / lattice
@@ -448,7 +449,7 @@ def _nodes_of(points: FloatArray, lattice: float) -> FloatArray | None:
 def full_cubes(
     points: FloatArray, kernel: Kernel, lattice: float
 ) -> tuple[FloatArray, FloatArray, Kernel]:
-    """Points (N, 3) left alone, centres (C, 3) of full cubes of lattice points, a cube's kernel.
+    """Return points (N, 3) left alone, centres (C, 3) of full lattice cubes, a cube's kernel.
 
     A cube counts as one point of a kernel that is wider by the cube's variance: off by less than
     1e-3 of its sum, as its side is at most half of ell. Few points, or those off the lattice, have
@@ -470,7 +471,7 @@ def full_cubes(
 def _blurred(
     source: FloatArray, kernel: Kernel, spacing: float, shape: list[int], stride: int
 ) -> FloatArray:
-    """A source (nx, ny, nz) blurred without amplitude, at every `stride`-th node from -K on."""
+    """Return a source (nx, ny, nz) blurred without amplitude, at each `stride`-th node from -K."""
     reach = kernel.reach(spacing, stride)
     x = np.arange(-reach, reach + 1) * spacing / kernel.ell
     weights = exps(-0.5 * x * x)

@@ -54,7 +54,7 @@ class DescentSettings(CheckedSettings):
             )
 
     def runners(self, block: int, starts: int) -> int:
-        """How many of the starts descend in a block."""
+        """Return the number of starts that descend in a block."""
         if self.race is None:
             return starts
         return math.ceil(self.race[min(block, len(self.race) - 1)] * starts)
@@ -63,7 +63,7 @@ class DescentSettings(CheckedSettings):
 def descend(
     objective: Objective, starts: Poses, settings: DescentSettings, observer: Observer
 ) -> tuple[Poses, FloatArray]:
-    """Estimates E' with their costs (B,), from B starts, each of which descends on its own.
+    """Return estimates E' with their costs (B,), from B starts, each of which descends on its own.
 
     Starts that drop out of the race stay where they are.
     """
@@ -92,10 +92,11 @@ def descend(
 
 @dataclass(frozen=True)
 class GradientDescentSettings:
-    """All settings of gradient descent."""
+    """Settings of gradient descent."""
 
-    cost: CostSettings = field(default_factory=CostSettings)
-    descent: DescentSettings = field(default_factory=DescentSettings)
+    cost: CostSettings = field(default_factory=CostSettings)  # the relaxed cost
+    descent: DescentSettings = field(default_factory=DescentSettings)  # of all starts
+    # E_0 and E_l of the next problem.
     online: OnlineSettings = field(default_factory=OnlineSettings)
     plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 

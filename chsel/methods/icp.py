@@ -31,7 +31,7 @@ _NO_SPREAD = 1e-20  # and so do those this much apart, m^2: points that differ b
 
 @dataclass(frozen=True)
 class IcpSettings(CheckedSettings):
-    """All settings of ICP."""
+    """Settings of ICP."""
 
     surface_points: Annotated[int, positive, at_most(MOST_POINTS)] = 2000  # Q, of the object
     # New points for every "registration", or the same for a session.
@@ -39,6 +39,7 @@ class IcpSettings(CheckedSettings):
     iterations: Annotated[int, not_negative, at_most(MOST_ITERATIONS)] = 100  # at most
     # End when the rms distance of no start falls by more than this fraction; None: never early.
     stop_below: Annotated[float | None, not_negative, at_most(1.0)] = 1e-6
+    # E_0 and E_l of the next problem.
     online: OnlineSettings = field(default_factory=OnlineSettings)
 
     presets: ClassVar[Presets] = {
@@ -67,7 +68,7 @@ class Icp(ConfiguredMethod[IcpSettings]):
         return ranked(poses.matrices, _distances(sets, poses))
 
     def surface(self, problem: RegistrationProblem) -> FloatArray:
-        """The points (Q, 3) of the object's surface that stand for it, in its frame, metres."""
+        """Return points (Q, 3) of the object's surface that stand for it, in its frame, metres."""
         sdf, key, count = problem.sdf, problem.key, self.settings.surface_points
         if self.settings.redraw == "registration":
             return surface_points(sdf, count, key.stream(Purpose.ICP_SURFACE))
@@ -76,7 +77,7 @@ class Icp(ConfiguredMethod[IcpSettings]):
         return sdf.derived(("icp", count, key), lambda: surface_points(sdf, count, stream))
 
     def _iterated(self, sets: _PointSets, poses: Poses, observer: Observer) -> Poses:
-        """Poses after as many iterations as the stop rule allows."""
+        """Return poses after as many iterations as the stop rule allows."""
         total, scratch = self.settings.iterations, partial(_scratch, sets)
         errors = np.full(len(poses), np.inf)
         for first in range(0, total, _BLOCK):
@@ -102,7 +103,7 @@ _PointSets = tuple[FloatArray, FloatArray]
 
 
 def _distances(sets: _PointSets, poses: Poses) -> FloatArray:
-    """The rms distances (B,) of the contacts to their nearest surface points, metres."""
+    """Return the rms distances (B,) of the contacts to their nearest surface points, metres."""
     out = np.empty(len(poses))
     run = partial(_fill_distances, sets, poses.numbers, out)
     parallel_for(run, len(poses), partial(_scratch, sets))
@@ -183,7 +184,7 @@ def _match(sets, pose, scratch):
 
 @inner
 def _aligned(points, pose, scratch):
-    """The pose that brings points (3, N) nearest to those matched (Horn, 1987, Sec. 4)."""
+    """Return the pose that brings points (3, N) nearest to those matched (Horn, 1987, Sec. 4)."""
     matched = scratch.matched
     x, y, z = _centre(points)
     u, v, w = _centre(matched)
@@ -205,7 +206,7 @@ def _aligned(points, pose, scratch):
 
 @leaf
 def _centre(points):
-    """The mean of points (3, N)."""
+    """Return the mean of points (3, N)."""
     x = y = z = 0.0
     count = points.shape[1]
     for n in range(count):
@@ -230,7 +231,7 @@ def _fill_form(s, form):
 
 @inner
 def _best_quaternion(pose, scratch):
-    """The eigenvector of the largest eigenvalue; of several, the unit vector nearest to `pose`."""
+    """Return the eigenvector of the largest eigenvalue; of several, that nearest to `pose`."""
     values, vectors = scratch.values, scratch.vectors
     best = vectors[0, 3], vectors[1, 3], vectors[2, 3], vectors[3, 3]
     least = values[3] - max(_NO_GAP * values[3], _NO_SPREAD)
@@ -253,7 +254,7 @@ def _best_quaternion(pose, scratch):
 
 @leaf
 def _rotation(quaternion):
-    """The rotation of a unit quaternion w, x, y, z."""
+    """Return the rotation of a unit quaternion w, x, y, z."""
     w, x, y, z = quaternion
     return (
         w * w + x * x - y * y - z * z,
@@ -270,7 +271,7 @@ def _rotation(quaternion):
 
 @inner
 def _rms(points, pose, matched):
-    """sqrt(mean |R x + t - y|^2) over points x (3, N) and those matched, y; infinite, never NaN."""
+    """Return sqrt(mean |R x + t - y|^2) over points x and matches y (3, N); infinite, never NaN."""
     total, count = 0.0, points.shape[1]
     for n in range(count):
         x, y, z = moved(pose, points[0, n], points[1, n], points[2, n])

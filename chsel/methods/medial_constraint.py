@@ -62,7 +62,7 @@ class Balls(NamedTuple):
 def medial_balls(
     free: FloatArray, workspace: Workspace, resolution: float, inflation: float
 ) -> Balls:
-    """Balls within the known-free voxels of a workspace that cover them but for `inflation`.
+    """Return balls within the known-free voxels of a workspace that cover them but for `inflation`.
 
     Largest first. Each is the largest that touches no voxel that is not free, around a centre that
     no ball covers so far; of equals, the first in row-major order.
@@ -89,7 +89,7 @@ def medial_balls(
 
 
 def _is_medial(squared: IntArray) -> BoolArray:
-    """Flags (nx, ny, nz) of voxels, of squared clearances, whose ball is in no neighbour's."""
+    """Return flags (nx, ny, nz) of voxels whose ball, by squared clearance, is in no other."""
     inner = squared[1:-1, 1:-1, 1:-1]
     radii, medial = np.sqrt(squared.astype(np.float64)), np.zeros(squared.shape, dtype=np.bool_)
     own, kept = radii[1:-1, 1:-1, 1:-1], inner > 0
@@ -105,7 +105,7 @@ def _is_medial(squared: IntArray) -> BoolArray:
 
 @compiled
 def _covering(voxels: IntArray, radii: FloatArray, inflation: float) -> IntArray:
-    """Indices of balls that, inflated, cover all others: each the next that is not yet covered."""
+    """Return indices of balls that, inflated, cover all: each the next not yet covered."""
     covered, chosen = np.zeros(len(radii), dtype=np.bool_), np.empty(len(radii), dtype=np.int64)
     count = 0
     for i in range(len(radii)):
@@ -127,7 +127,7 @@ class MedialCostSettings(CheckedSettings):
     # Weights of the two means; a ball_scale of 0 ignores free space, as the authors' released code
     # does, whose balls never enter the cost.
     ball_scale: Annotated[float, not_negative] = 1.0
-    known_scale: Annotated[float, not_negative] = 1.0
+    known_scale: Annotated[float, not_negative] = 1.0  # of known points
     lookup: Annotated[str, one_of(*LOOKUPS)] = "trilinear"  # how the SDF is read, see SdfGrid.at
     outside: Annotated[str, one_of(*OUTSIDE)] = "surface_point"  # and beyond its box
 
@@ -143,15 +143,15 @@ class MedialCostSettings(CheckedSettings):
 
 
 class MedialModel(NamedTuple):
-    """All that determines the cost of a pose."""
+    """Data of the cost, but the pose."""
 
-    field: DistanceField
+    field: DistanceField  # of the object
     centres: FloatArray  # (3, N_b), of the balls, world, metres
     radii: FloatArray  # (N_b,)
     known: FloatArray  # (3, N_k), world, metres
     known_sdf: FloatArray  # (N_k,)
-    ball_scale: float
-    known_scale: float
+    ball_scale: float  # of the mean over balls
+    known_scale: float  # of the mean over known points
 
 
 class MedialCost:
@@ -190,18 +190,18 @@ class MedialCost:
         )
 
     def costs(self, vectors: FloatArray) -> FloatArray:
-        """Costs (B,) of vectors (B, d) of the search space."""
+        """Return costs (B,) of vectors (B, d) of the search space."""
         return self.evaluate(self.space.poses(vectors))
 
     def evaluate(self, poses: Poses) -> FloatArray:
-        """Costs (B,) of poses; infinite for one that is not finite."""
+        """Return costs (B,) of poses; infinite for one that is not finite."""
         costs = np.empty(len(poses))
         run = partial(_fill_costs, self.model, poses.numbers, costs)
         parallel_for(run, len(poses), self.work, least=_POSES_PER_THREAD)
         return costs
 
     def work(self) -> Places:
-        """Scratch for one thread."""
+        """Return scratch for one thread."""
         return places_for(max(len(self.model.radii), len(self.model.known_sdf)))
 
 
@@ -221,7 +221,7 @@ def _medial_costs_of(model, space, vectors, costs, places):
 
 @inner
 def _cost(model, pose, places):
-    """C_M, each mean scaled; infinite for a pose that is not finite."""
+    """Return C_M, each mean scaled; infinite for a pose that is not finite."""
     if not finite(pose):
         return np.inf
     cost = model.ball_scale * _ball_mean(model, pose, places)
@@ -231,7 +231,7 @@ def _cost(model, pose, places):
 
 @spliced
 def _ball_mean(model, pose, places):
-    """The mean square of how deep balls reach into the object."""
+    """Return the mean square of how deep balls reach into the object."""
     field, radii = model.field, model.radii
     xs, ys, zs = model.centres[0], model.centres[1], model.centres[2]
     locate(pose, field.box, xs, ys, zs, places, len(radii))
@@ -246,7 +246,7 @@ def _ball_mean(model, pose, places):
 
 @spliced
 def _known_mean(model, pose, places):
-    """The mean square of s - v over points of known signed distance v, 0 for contacts."""
+    """Return the mean square of s - v over points of known signed distance v, 0 for contacts."""
     field, known_sdf = model.field, model.known_sdf
     xs, ys, zs = model.known[0], model.known[1], model.known[2]
     locate(pose, field.box, xs, ys, zs, places, len(known_sdf))
@@ -281,14 +281,14 @@ class CmaEsSettings(CheckedSettings):
     }
 
     def size(self, dimension: int, count: int) -> int:
-        """Samples of a generation in `dimension` dimensions, for `count` hypotheses."""
+        """Return samples of a generation in `dimension` dimensions, for `count` hypotheses."""
         if self.population is not None:
             return self.population
         usual = 4 + math.floor(3.0 * float(logs(float(dimension))))
         return max(usual, min(count, MOST_SAMPLES)) if self.starts == "single" else usual
 
     def most_generations(self, dimension: int, size: int) -> int:
-        """Of a run in `dimension` dimensions, of so many samples each."""
+        """Return the most generations of a run in `dimension` dimensions with such samples."""
         if self.generations is not None:
             return self.generations
         return 100 + math.floor(150.0 * (dimension + 3.0) * (dimension + 3.0) / math.sqrt(size))
@@ -297,7 +297,7 @@ class CmaEsSettings(CheckedSettings):
 class Run(NamedTuple):
     """State of one run in d dimensions."""
 
-    strategy: Strategy
+    strategy: Strategy  # of CMA-ES
     batch: Batch  # a generation; value (L,): minus the costs
     best: FloatArray  # (d,), the vector of lowest cost so far
     cost: FloatArray  # (1,), its cost
@@ -312,7 +312,7 @@ def evolved(
     key: StreamKey,
     observer: Observer,
 ) -> FloatArray:
-    """Search vectors (B, d) of the estimates that CMA-ES finds from E_0."""
+    """Return search vectors (B, d) of the estimates that CMA-ES finds from E_0."""
     vectors = objective.space.encode(initial_set)
     runs = run_all(objective, vectors, settings, key, observer)
     if settings.starts == "per_start":
@@ -334,7 +334,7 @@ def run_all(
     key: StreamKey,
     observer: Observer,
 ) -> list[Run]:
-    """A run from each of vectors (B, d), or from the first, all to their ends, block by block."""
+    """Return a run from each of vectors (B, d), or from the first, to their ends, by blocks."""
     starts = vectors[:1] if settings.starts == "single" else vectors
     dimension = vectors.shape[1]
     size = settings.size(dimension, len(vectors))
@@ -381,7 +381,7 @@ def _trace(observer: Observer, runs: list[Run]) -> None:
 def evolve(
     model: Any, space: Any, work: Any, run: Run, normals: FloatArray, tolerance: float
 ) -> None:
-    """Generations of CMA-ES (Hansen, 2016), as many as normals (G, L, d), or to the end.
+    """Run generations of CMA-ES (Hansen, 2016), as many as normals (G, L, d), or to the end.
 
     The better half of a generation are parents, weighted by rank, all weights positive.
     """
@@ -407,10 +407,11 @@ def evolve(
 
 @dataclass(frozen=True)
 class MedialConstraintSettings:
-    """All settings of Medial Constraint."""
+    """Settings of Medial Constraint."""
 
-    cost: MedialCostSettings = field(default_factory=MedialCostSettings)
-    cma_es: CmaEsSettings = field(default_factory=CmaEsSettings)
+    cost: MedialCostSettings = field(default_factory=MedialCostSettings)  # C_M
+    cma_es: CmaEsSettings = field(default_factory=CmaEsSettings)  # of the runs
+    # E_0 and E_l of the next problem.
     online: OnlineSettings = field(default_factory=OnlineSettings)
     plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 
@@ -441,13 +442,14 @@ _OUTPUT = OutputSettings(
 
 @dataclass(frozen=True)
 class MedialConstraintCmaMeSettings:
-    """All settings of Medial Constraint with CMA-ME."""
+    """Settings of Medial Constraint with CMA-ME."""
 
-    cost: MedialCostSettings = field(default_factory=MedialCostSettings)
-    cma_es: CmaEsSettings = field(default_factory=CmaEsSettings)
+    cost: MedialCostSettings = field(default_factory=MedialCostSettings)  # C_M
+    cma_es: CmaEsSettings = field(default_factory=CmaEsSettings)  # of the runs
     archive: ArchiveSettings = _ARCHIVE  # tolerances in m^2, as the cost is
-    emitter: EmitterSettings = _EMITTER
+    emitter: EmitterSettings = _EMITTER  # CMA-ME
     output: OutputSettings = _OUTPUT  # tolerances in m^2
+    # E_0 and E_l of the next problem.
     online: OnlineSettings = field(default_factory=OnlineSettings)
     plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 

@@ -1,4 +1,4 @@
-"""What every registration method offers, and the part of it that those of this package share."""
+"""The interface of every registration method, and the base of those of this package."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class Method(Protocol):
 
     @property
     def online(self) -> OnlineSettings:
-        """How a session makes the next problem for this method."""
+        """The making of a session's next problem for this method."""
 
     def register(
         self, problem: RegistrationProblem, observer: Observer | None = None
     ) -> Hypotheses:
-        """Hypotheses, best first. The observer sees intermediate results and changes nothing."""
+        """Return hypotheses, best first. The observer sees intermediate results alone."""
 
 
 Settings = TypeVar("Settings", bound=Any)
@@ -43,14 +43,14 @@ class ConfiguredMethod(Generic[Settings]):
 
     @property
     def online(self) -> OnlineSettings:
-        """How a session makes the next problem for this method."""
+        """The making of a session's next problem for this method."""
         online: OnlineSettings = self.settings.online
         return online
 
     def register(
         self, problem: RegistrationProblem, observer: Observer | None = None
     ) -> Hypotheses:
-        """Hypotheses for the known points of a problem, best first."""
+        """Return hypotheses for the known points of a problem, best first."""
         require_ieee_arithmetic()
         return self._hypotheses(problem, observer or NullObserver())
 

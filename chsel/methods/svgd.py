@@ -45,7 +45,7 @@ class Particles(NamedTuple):
 
 
 def particles_at(vectors: FloatArray) -> Particles:
-    """Particles at search vectors (B, d), which are copied."""
+    """Return particles at search vectors (B, d), which are copied."""
     count, dimension = vectors.shape
     moments, pairs = np.zeros((count, 2, dimension)), np.zeros((2, count * (count - 1) // 2))
     scores, directions = np.zeros((2, count, dimension))
@@ -53,7 +53,7 @@ def particles_at(vectors: FloatArray) -> Particles:
 
 
 class SteinStep(NamedTuple):
-    """How particles move in an iteration."""
+    """Settings of a step of the particles."""
 
     sharpness: float  # beta
     scale: float  # h of the kernel
@@ -141,7 +141,7 @@ def direct(particles: Any, scale: Any, median: Any) -> None:
 
 @inner
 def _median(values: Any) -> Any:
-    """The median of values (S,), S > 0, which are reordered."""
+    """Return the median of values (S,), S > 0, which are reordered."""
     middle = len(values) // 2
     first, last = 0, len(values) - 1
     while first < last:  # quickselect (Hoare, 1961): values of [first, last] hold the middle one
@@ -167,7 +167,7 @@ def _median(values: Any) -> Any:
 
 @dataclass(frozen=True)
 class SvgdSettings(CheckedSettings):
-    """All settings of Stein variational gradient descent (Liu and Wang, 2016)."""
+    """Settings of Stein variational gradient descent (Liu and Wang, 2016)."""
 
     sharpness: Annotated[float, positive] = 5.0  # beta of p = exp(-beta C)
     # "reference" of fixed scale, or "median": the median heuristic, every iteration.
@@ -175,9 +175,10 @@ class SvgdSettings(CheckedSettings):
     # h of k(a, b) = exp(-|a - b|^2 / (2 h^2)) of search vectors; of the median heuristic where
     # there is no pair.
     scale: Annotated[float, positive] = 0.01
-    iterations: Annotated[int, not_negative, at_most(MOST_ITERATIONS)] = 300
+    iterations: Annotated[int, not_negative, at_most(MOST_ITERATIONS)] = 300  # of all particles
     rate: Annotated[float, positive] = 0.005  # of Adam
-    cost: CostSettings = field(default_factory=CostSettings)
+    cost: CostSettings = field(default_factory=CostSettings)  # C, the relaxed cost
+    # E_0 and E_l of the next problem.
     online: OnlineSettings = field(default_factory=OnlineSettings)
     plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 

@@ -32,14 +32,14 @@ class ReachBall(CheckedSettings):
 
 @dataclass(frozen=True)
 class ActionSettings(CheckedSettings):
-    """Which probes a session offers. A recorded session offers its probes, whatever is chosen."""
+    """The probes that a session offers. A recorded session offers its probes."""
 
     # "configuration" the grid of the session itself, "forward" along its approach direction on a
     # lattice across the workspace, "around" from the sides and from above.
     choice: Annotated[str, one_of("configuration", "forward", "around")] = "around"
     # Of the lattice, metres; it is coarser where more than `most` actions would result.
     spacing: Annotated[float, positive] = 0.05
-    most: Annotated[int, positive, at_most(10_000)] = 200
+    most: Annotated[int, positive, at_most(10_000)] = 200  # actions
     # Where the hand can be; actions that begin outside of it are left out, and those that lead out
     # of it end there. None: everywhere.
     reach: ReachBall | None = None
@@ -50,7 +50,7 @@ class ActionSettings(CheckedSettings):
 
 
 def straight_actions(settings: ActionSettings, poses: FloatArray, length: FloatArray) -> Actions:
-    """Actions from poses (A, 4, 4) along their z axes for lengths (A,), as far as reach allows.
+    """Return actions from poses (A, 4, 4) along z for lengths (A,), as far as reach allows.
 
     Those of length 0 are left out. Seconds, if a speed is given: there and back, and the setup.
     Raises SettingError if none is left.
@@ -80,7 +80,7 @@ def forward_actions(
     start: float,
     length: float,
 ) -> Actions:
-    """A lattice across a workspace, all in one horizontal direction.
+    """Return a lattice across a workspace, all in one horizontal direction.
 
     rotation (3, 3): world_from_hand. start: of the hand's origin along that direction, metres in
     the world. length: of every action, metres. Raises SettingError if none is left.
@@ -95,7 +95,7 @@ def forward_actions(
 
 
 def around_actions(settings: ActionSettings, workspace: Workspace, hand: HandShape) -> Actions:
-    """Lattices of actions that start outside of a workspace and cross it, as far as the floor.
+    """Return lattices of actions that cross a workspace from outside, as far as the floor.
 
     From the four sides, and from above. Opposite sides are half a spacing apart, as what one of
     them misses the other should meet. Raises SettingError if none is left.
@@ -116,7 +116,7 @@ def around_actions(settings: ActionSettings, workspace: Workspace, hand: HandSha
 
 
 def _rotation(across: tuple[float, ...], forward: tuple[float, ...]) -> FloatArray:
-    """world_from_hand (3, 3) of a hand whose wide side is `across` and that probes `forward`."""
+    """Return world_from_hand (3, 3) of a hand that is wide `across` and probes `forward`."""
     y, z = np.array(across), np.array(forward)
     return np.stack([np.cross(y, z), y, z], axis=1)
 
@@ -159,7 +159,7 @@ class _Approach:
         self._front = float(hand.bounds[1, 2])
 
     def places(self, spacing: float, shift: float = 0.0) -> FloatArray:
-        """A lattice (A, 2) of places across the workspace; shift: of the first, in spacings.
+        """Return a lattice (A, 2) of places across the workspace; shift: of the first, in spacings.
 
         If the hand moves horizontally, the lowest row is just above the floor.
         """
@@ -174,13 +174,13 @@ class _Approach:
         return np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1).reshape(-1, 2)
 
     def poses(self, places: FloatArray, start: float) -> FloatArray:
-        """Poses (A, 4, 4) at places (A, 2), `start` metres along the direction of probing."""
+        """Return poses (A, 4, 4) at places (A, 2), `start` metres along the probes."""
         positions = places[:, :1] * self._axes[0] + places[:, 1:] * self._axes[1]
         positions = positions + start * self._direction
         return compose(np.broadcast_to(self._rotation, (len(places), 3, 3)), positions)
 
     def lengths(self, places: FloatArray, start: float) -> FloatArray:
-        """How far (A,) the hand goes from `start` until its front is through the workspace.
+        """Return lengths (A,) from `start` until the hand's front is through the workspace.
 
         It stops above the floor. 0 where it does not get into the workspace.
         """
@@ -202,7 +202,7 @@ class _Approach:
 
 
 def _centred(low: float, high: float, spacing: float) -> FloatArray:
-    """The middles (N,) of intervals of a spacing that cover what is between two numbers."""
+    """Return the middles (N,) of intervals of a spacing that cover what is between two numbers."""
     count = max(int(np.ceil((high - low) / spacing - 0.5)), 1)
     steps: FloatArray = np.arange(count, dtype=np.float64) - 0.5 * (count - 1)
     return 0.5 * (low + high) + spacing * steps
@@ -211,7 +211,7 @@ def _centred(low: float, high: float, spacing: float) -> FloatArray:
 def _few_enough(
     settings: ActionSettings, workspace: Workspace, lattice: Callable[[float], _Lattice]
 ) -> _Lattice:
-    """The lattice at the spacing of the settings, or at the next coarser one that is allowed."""
+    """Return the lattice at the spacing of the settings, or the next coarser one allowed."""
     sides = np.sort(np.ptp(workspace.bounds, axis=0))
     # With any less, one face alone has more.
     face = float(np.sqrt(sides[1] * sides[2] / (2.0 * settings.most)))
@@ -225,7 +225,7 @@ def _few_enough(
 
 
 def _way_within(reach: ReachBall, poses: FloatArray) -> FloatArray:
-    """How far (A,) the hand can go from poses (A, 4, 4) along their z axes; -1 from outside."""
+    """Return lengths (A,) that a hand can go from poses (A, 4, 4) along z; -1 from outside."""
     offset, direction = poses[:, :3, 3] - np.array(reach.center), poses[:, :3, 2]
     along = (offset * direction).sum(axis=1)
     inside = reach.radius * reach.radius - (offset * offset).sum(axis=1)

@@ -29,7 +29,7 @@ none left that can be taken, or as many were made as were allowed. "" if one is 
 
 
 class HandFront(NamedTuple):
-    """How far the hand reaches along its z axis, over cells of its x and y axes."""
+    """The reach of the hand along its z axis, over cells of its x and y axes."""
 
     heights: FloatArray  # (X, Y), metres; -inf where there is no hand
     lower: FloatArray  # (2,): x and y of the first cell's corner, hand frame, metres
@@ -58,7 +58,7 @@ class HandShape:
 
     @classmethod
     def of(cls, mesh: trimesh.Trimesh) -> HandShape:
-        """The shape of a mesh in the hand's frame, metres."""
+        """Return the shape of a mesh in the hand's frame, metres."""
         return cls(mesh.vertices, mesh.faces)
 
     @cached_property
@@ -179,10 +179,10 @@ class DecisionProblem:
     points: KnownPoints  # all that are known, in the world
     workspace: Workspace  # where the object can be
     free_resolution: float  # side of the voxels of free space, metres
-    belief: Belief
+    belief: Belief  # weighted poses of the object
     actions: Actions  # that the session offers
     available: BoolArray  # (A,): which of them can be taken now
-    hand: HandShape
+    hand: HandShape  # that probes
     key: StreamKey  # of the random streams; its step is the number of probes done
     verdict: str = ""  # on the result that the belief is of, one of VERDICTS; "" if there is none
 
@@ -235,7 +235,7 @@ class Decision:
 
 
 def _near_poses(name: str, transforms: FloatArray) -> FloatArray:
-    """Rigid transforms (B, 4, 4); PoseError for others, or farther than FARTHEST along an axis."""
+    """Return rigid transforms (B, 4, 4); PoseError for others, or farther than FARTHEST."""
     poses = frozen(name, transforms, (None, 4, 4), error=PoseError)
     check_rigid(name, poses)
     far = np.abs(poses[:, :3, 3]).max(axis=1, initial=0.0) > FARTHEST

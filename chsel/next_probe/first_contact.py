@@ -1,4 +1,4 @@
-"""Where a hand that moves straight ahead first meets an object, in many poses of it."""
+"""First contacts of a hand that moves straight ahead with an object in many poses."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def first_contacts(
 
 
 def touched_points(sdf: SdfGrid) -> TouchedPoints:
-    """Points on the object's surface that a hand can touch."""
+    """Return points on the object's surface that a hand can touch."""
 
     def make() -> TouchedPoints:
         stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
@@ -108,7 +108,7 @@ def touched_points(sdf: SdfGrid) -> TouchedPoints:
 
 
 def moves_by_orientation(actions: Actions) -> Iterator[Moves]:
-    """The actions by the orientation of the hand, in the order of their first ones."""
+    """Yield the actions by the orientation of the hand, in the order of their first ones."""
     rotations = actions.world_from_hand[:, :3, :3]
     left = np.ones(len(actions), dtype=bool)
     while left.any():
@@ -173,7 +173,7 @@ def meet(
                             third, best[2] = way, p
             if best[0] < 0:
                 continue
-            place = (seen[best[0], 0], seen[best[0], 1], seen[best[0], 2])
+            point = (seen[best[0], 0], seen[best[0], 1], seen[best[0], 2])
             for b in range(3):
                 if best[b] < 0:
                     break
@@ -183,17 +183,17 @@ def meet(
                     if i >= 0.0 and i < nx and j >= 0.0 and j < ny:
                         way = w - z - heights[int(i), int(j)]
                         if way < least:
-                            least, place = way, (u, v, w)
+                            least, point = way, (u, v, w)
             if least <= moves.length[a]:
                 column = moves.which[a]
                 travel[k, column] = least
-                x, y, z = turned_back(turn, place[0], place[1], place[2])
+                x, y, z = turned_back(turn, point[0], point[1], point[2])
                 contact[k, column, 0], contact[k, column, 1], contact[k, column, 2] = x, y, z
 
 
 @leaf
 def _hand_from_object(turn: Any, pose: Any) -> Any:
-    """The rotation into axes of the hand, then the translation of a pose (12,)."""
+    """Return the rotation into axes of the hand, then the translation of a pose (12,)."""
     a, d, g = turned(turn, pose[0], pose[1], pose[2])
     b, e, h = turned(turn, pose[3], pose[4], pose[5])
     c, f, i = turned(turn, pose[6], pose[7], pose[8])
@@ -202,13 +202,13 @@ def _hand_from_object(turn: Any, pose: Any) -> Any:
 
 @leaf
 def _turned(pose: Any, x: Any, y: Any, z: Any) -> Any:
-    """A place of the object in axes of the hand."""
+    """Return a point of the object in axes of the hand."""
     return turned(pose, x - pose[9], y - pose[10], z - pose[11])
 
 
 @inner
 def _look(points: Any, hand_from_object: Any, view: Any, cell: Any) -> Any:
-    """Order what the hand sees of the object by cells; x and y of the first cell's corner."""
+    """Order the object's points that the hand sees by cells; return the first cell's corner."""
     seen, nearest = view.seen, view.nearest
     size, per_cell = len(nearest), 1.0 / cell
     low_x, low_y = np.inf, np.inf

@@ -1,4 +1,4 @@
-"""What is believed of the pose, what each action would show of it, and how surprising that is."""
+"""The belief in the pose, the forecast of each action, and the surprise of an outcome."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _WRONG = 0.001  # likelihood of a hit where a pose forecasts a miss, and the oth
 
 @dataclass(frozen=True)
 class BeliefSettings(CheckedSettings):
-    """Which poses a decision weighs up."""
+    """The poses that a decision weighs up."""
 
     poses: Annotated[int, positive, at_most(MOST_POSES)] = 100  # K, at most
     # Height in the world of the floor that the object lies on, metres; None: it may be anywhere.
@@ -50,7 +50,7 @@ class BeliefSettings(CheckedSettings):
 
 
 def belief_after(hypotheses: Hypotheses, settings: BeliefSettings) -> Belief:
-    """The candidates of a registration, or its hypotheses if it has none; all weigh the same."""
+    """Return the candidates of a registration, else its hypotheses, all with one weight."""
     poses = hypotheses.candidates
     if len(poses) == 0:
         poses = hypotheses.object_from_world[~hypotheses.duplicate]
@@ -65,7 +65,7 @@ def belief_before(
     key: StreamKey,
     settings: BeliefSettings,
 ) -> Belief:
-    """Poses with the object's centre in the workspace, turned any way, that free points allow.
+    """Return poses with the centre in the workspace, turned any way, that free points allow.
 
     The first of those drawn that free space does not enter by more than its grid's resolution; if
     they are too few, those that it enters least.
@@ -91,19 +91,19 @@ def belief_before(
 
 
 def _depths(sdf: SdfGrid, poses: Poses, free: FloatArray) -> FloatArray:
-    """Depth (B,) of the deepest of free points (N, 3), metres, at least the resolution."""
+    """Return depth (B,) of the deepest of free points (N, 3), metres, at least the resolution."""
     deepest: FloatArray = -signed_distances(sdf, poses, free).min(axis=1, initial=np.inf)
     return np.maximum(deepest, sdf.resolution)
 
 
 def heights(sdf: SdfGrid, poses: Poses, floor: float) -> FloatArray:
-    """How far the object's lowest point is above the floor (B,) in each pose, metres."""
+    """Return heights (B,) of the object's lowest point above the floor in each pose, metres."""
     lowest: FloatArray = outline_in_world(sdf, poses)[..., 2].min(axis=1) - floor
     return lowest
 
 
 class _Gains(NamedTuple):
-    """What the kernel fills, for A actions."""
+    """Arrays of A actions that the kernel fills."""
 
     information: FloatArray  # (A,), nats
     # (A,), metres: root mean square distance of the surface in the pose that shows the outcome
@@ -120,12 +120,12 @@ class Forecast:
     noise: standard deviation of a contact's place from where it is forecast, metres.
     """
 
-    problem: DecisionProblem
-    noise: float
+    problem: DecisionProblem  # the decision
+    noise: float  # metres
 
     @cached_property
     def first(self) -> FirstContacts:
-        """Where each action meets the object, by pose."""
+        """The first contacts of each action, by pose."""
         of = self.problem
         return first_contacts(of.sdf, of.belief, of.actions, of.hand)
 
@@ -146,7 +146,7 @@ class Forecast:
 
     @cached_property
     def distances(self) -> FloatArray:
-        """How far the surface in one pose is from that in another (K, K), metres."""
+        """Distances (K, K) of the surfaces in poses from each other, metres."""
         poses = Poses.of(self.problem.belief.object_from_world)
         return outline_distances(self.problem.sdf, poses)
 
@@ -157,7 +157,7 @@ class Forecast:
 
     @cached_property
     def gains(self) -> _Gains:
-        """What is gained by each action."""
+        """The gains of each action."""
         count = len(self.problem.actions)
         gains = _Gains(np.zeros(count), np.empty(count), np.empty(count), np.ones(count))
         weights, distances = np.array(self.problem.belief.weights), self.distances
@@ -171,7 +171,7 @@ class Forecast:
         return gains
 
     def _chance(self, flags: BoolArray) -> FloatArray:
-        """Weight (A,) of the poses with a flag, of flags (K, A)."""
+        """Return weight (A,) of the poses with a flag, of flags (K, A)."""
         return in_order(np.where(flags, self.problem.belief.weights[:, None], 0.0).T)
 
 
@@ -231,17 +231,17 @@ def overlap(
 
 @dataclass(frozen=True)
 class SurpriseSettings(CheckedSettings):
-    """What follows from an outcome that no pose of the belief has forecast."""
+    """The response to an outcome that no pose of the belief has forecast."""
 
     # Above so many nats the next registration starts afresh, with so many times the hypotheses.
     limit: Annotated[float, not_negative] = 6.0
-    larger: Annotated[int, positive, at_most(100)] = 3
+    larger: Annotated[int, positive, at_most(100)] = 3  # factor of the hypotheses
 
 
 def surprise(
     problem: DecisionProblem, decision: Decision, noise: float, contact: FloatArray | None
 ) -> float:
-    """-ln of the chance that was forecast for the outcome of the chosen action, nats.
+    """Return -ln of the chance that was forecast for the outcome of the chosen action, nats.
 
     contact (3,): where the hand has met the object, world frame, metres; None if it has not.
     noise: of contacts, metres. Places within the scatter of the forecast contacts, and within the

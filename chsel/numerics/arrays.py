@@ -46,7 +46,7 @@ def frozen(
     finite: bool = True,
     most: float = math.inf,
 ) -> NDArray[Any]:
-    """A read-only, C-ordered copy of `value` with the given shape (None: any length).
+    """Return a read-only, C-ordered copy of `value` with the given shape (None: any length).
 
     Takes numpy arrays, torch tensors and nested lists. most: the largest coordinate, metres.
     Raises `error` with `name` in the message if the value is not an array of real numbers, has
@@ -83,14 +83,14 @@ def frozen(
 
 
 def read_only(points: FloatArray) -> FloatArray:
-    """The same numbers as C-ordered float64 that cannot be written, copied only if they must be."""
+    """Return the numbers as C-ordered float64 that cannot be written, copied only if needed."""
     array = np.ascontiguousarray(points, dtype=np.float64).view()
     array.setflags(write=False)
     return array
 
 
 def scratch(*shape: int, dtype: Any = np.float64) -> NDArray[Any]:
-    """Zeros of a shape that one thread writes again and again.
+    """Return zeros of a shape that one thread writes again and again.
 
     They share no cache line with other data, which would slow down other threads, and begin with
     one, as vector instructions are faster then.
@@ -102,12 +102,12 @@ def scratch(*shape: int, dtype: Any = np.float64) -> NDArray[Any]:
 
 
 def evenly_spaced(size: int, count: int) -> IntArray:
-    """At most `count` of the numbers below size, evenly spaced, beginning with 0."""
+    """Return at most `count` of the numbers below size, evenly spaced, beginning with 0."""
     return np.arange(size) if size <= count else np.arange(count) * size // count
 
 
 def digest(*arrays: NDArray[Any]) -> str:
-    """BLAKE2b (128 bit, hexadecimal) of the types, shapes and bytes of arrays, in order."""
+    """Return BLAKE2b (128 bit, hexadecimal) of the types, shapes and bytes of arrays, in order."""
     state = hashlib.blake2b(digest_size=16)
     for array in arrays:
         array = np.ascontiguousarray(array)
@@ -149,7 +149,7 @@ def read_npz(
     most_bytes: int = MOST_BYTES,
     error: type[ChselError],
 ) -> dict[str, np.ndarray[Any, Any]]:
-    """The arrays by name; every checksum is compared, and no pickled object is loaded.
+    """Return the arrays by name; every checksum is compared, and no pickled object is loaded.
 
     accepted: names that the arrays may have (None: any). most_bytes: limit of all arrays, unpacked.
     Raises `error` with a message of one line for any defect of the file.

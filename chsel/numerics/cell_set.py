@@ -18,7 +18,7 @@ class Box(NamedTuple):
     """The nodes of a grid and the cells of its points, in numbers alone."""
 
     first: tuple[float, float, float]  # corner nodes, metres
-    last: tuple[float, float, float]
+    last: tuple[float, float, float]  # the last node, metres
     inverse: float  # nodes per metre
     between: float  # 0: cells lie around nodes; 1: between nodes, numbered by their lowest node
     most: tuple[float, float, float]  # the greatest index of a cell per axis
@@ -32,7 +32,7 @@ class CellSet(NamedTuple):
     Distances are those between cells as boxes, in sides of a cell: 0 for neighbours, too.
     """
 
-    box: Box
+    box: Box  # of the cells
     # (nodes + 2,) 0 in the set, else 1 + the squared distance to it, at most 226; then 0 for points
     # that may be in the set, and 255 for none; uint8
     steps: Any
@@ -41,7 +41,7 @@ class CellSet(NamedTuple):
 def box_of(
     first: FloatArray, resolution: float, shape: Sequence[int], *, between: bool = False
 ) -> Box:
-    """The box of a grid of nodes (nx, ny, nz) whose first node is at `first` (3,)."""
+    """Return the box of a grid of nodes (nx, ny, nz) whose first node is at `first` (3,)."""
     x, y, z = (int(count) for count in shape)
     last = first + (np.array([x, y, z]) - 1) * resolution
     most = triple(np.array([x, y, z]) - (2 if between else 1))
@@ -50,13 +50,13 @@ def box_of(
 
 
 def triple(values: Sequence[float] | FloatArray) -> tuple[float, float, float]:
-    """Three numbers as a tuple, which kernels pass on at no cost."""
+    """Return three numbers as a tuple, which kernels pass on at no cost."""
     x, y, z = (float(value) for value in values)
     return x, y, z
 
 
 def cell_set_of(box: Box, cells: BoolArray) -> CellSet:
-    """The set of the flagged cells (nx, ny, nz) of a box."""
+    """Return the set of the flagged cells (nx, ny, nz) of a box."""
     halves, steps = np.empty(cells.shape, np.int64), np.empty(cells.size + 2, dtype=np.uint8)
     squared_clearances(~cells, halves, 2)
     steps[:-2] = np.where(cells, 0, 1 + np.minimum(halves // 4, _MOST_STEPS)).reshape(-1)
@@ -85,7 +85,7 @@ def squared_clearances(inside: BoolArray, out: IntArray, gap: int) -> None:
 
 @inner
 def _along(flat: IntArray, count: int, stride: int, line: IntArray, gap: int) -> None:
-    """One axis, whose neighbours are `stride` apart in lines of `count` voxels."""
+    """Fill one axis, whose neighbours are `stride` apart in lines of `count` voxels."""
     for block in range(0, len(flat), count * stride):
         for start in range(block, block + stride):
             for k in range(count):
@@ -96,7 +96,7 @@ def _along(flat: IntArray, count: int, stride: int, line: IntArray, gap: int) ->
 
 @inner
 def _nearest(line: IntArray, count: int, k: int, gap: int) -> int:
-    """The least of line[j] + max(2 |k - j| - gap, 0)^2, going outwards while that can be less."""
+    """Return the least of line[j] + max(2 |k - j| - gap, 0)^2, going outwards."""
     least, reach = line[k], max(k, count - 1 - k)
     for step in range(1, reach + 1):
         along = (2 * step - gap) * (2 * step - gap)
@@ -110,7 +110,7 @@ def _nearest(line: IntArray, count: int, k: int, gap: int) -> int:
 
 
 def bounds_of(points: FloatArray) -> FloatArray:
-    """The least and the greatest coordinates (2, 3) of points (N, 3), N > 0."""
+    """Return the least and the greatest coordinates (2, 3) of points (N, 3), N > 0."""
     bounds = np.empty((2, 3))
     _fill_bounds(read_only(points), bounds)
     return bounds
@@ -131,26 +131,57 @@ def set_voxels(points: FloatArray, first: FloatArray, side: float, flags: BoolAr
 
     first (3,): centre of a voxel, which is (1, 1, 1); no point may be further than one beyond.
     """
-    x, y, z = first[0], first[1], first[2]
     for n in range(len(points)):
-        i = int(np.rint((points[n, 0] - x) / side)) + 1
-        j = int(np.rint((points[n, 1] - y) / side)) + 1
-        k = int(np.rint((points[n, 2] - z) / side)) + 1
-        flags[i, j, k] = True
+        i, j, k = voxel_of(first, side, points[n, 0], points[n, 1], points[n, 2])
+        flags[int(i) + 1, int(j) + 1, int(k) + 1] = True
+
+
+def voxels_of(points: FloatArray, first: FloatArray, side: float) -> IntArray:
+    """Return indices (N, 3) of the voxels nearest to points (N, 3), ties to even.
+
+    first (3,): centre of the voxel 0, 0, 0. side: of voxels, metres.
+    """
+    return np.rint((points - first) / side).astype(np.int64)
+
+
+@leaf
+def voxel_of(first, side, x, y, z):
+    """Return the indices, whole numbers as floats, of the voxel nearest to a point, ties to even.
+
+    The same numbers as of `voxels_of`.
+    """
+    return (
+        np.rint((x - first[0]) / side),
+        np.rint((y - first[1]) / side),
+        np.rint((z - first[2]) / side),
+    )
+
+
+@leaf
+def nearest_node(first, inverse, x, y, z):
+    """Return the indices, whole numbers as floats, of the node nearest to a point, ties to even.
+
+    inverse: nodes per metre, as a Box has it; rounding may differ from that of `voxel_of`.
+    """
+    return (
+        np.rint((x - first[0]) * inverse),
+        np.rint((y - first[1]) * inverse),
+        np.rint((z - first[2]) * inverse),
+    )
 
 
 class Places(NamedTuple):
-    """Where S points lie in a grid: scratch of one thread."""
+    """Cells of S points in a grid: scratch of one thread."""
 
     beyond: FloatArray  # (S,) squared distance to the grid's box, m^2
     cell: Any  # (S,) flat index of the cell, int32
     u: FloatArray  # (S,) from the cell's node to the point, clamped to the box, in cells
-    v: FloatArray
-    w: FloatArray
+    v: FloatArray  # on the second axis
+    w: FloatArray  # on the third axis
 
 
 def places_for(size: int) -> Places:
-    """Scratch for `size` points."""
+    """Return scratch for `size` points."""
     u, v, w = (np.empty(size) for _ in range(3))
     return Places(np.empty(size), np.empty(size, dtype=np.int32), u, v, w)
 
@@ -179,7 +210,7 @@ def locate(move, box, x, y, z, places, count):
 
 @leaf
 def node_of(g, between, most):
-    """The node of the cell that holds a grid coordinate: the nearest, or the one below."""
+    """Return the node of the cell that holds a grid coordinate: the nearest, or the one below."""
     nearest = np.rint(g)
     below = nearest - between
     return min(below if nearest > g else nearest, most)

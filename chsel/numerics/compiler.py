@@ -1,4 +1,4 @@
-"""How kernels are compiled, and where their machine code is kept.
+"""Kernels: how they are compiled, and where their machine code is kept.
 
 Numba's own cache keeps it, in a folder for each state of the code: a kernel contains what it calls
 and the constants of other files, which numba does not check. So the folder is named by a digest of
@@ -50,7 +50,7 @@ _log = logging.getLogger(__name__)
 
 
 def compiled(function: Function) -> Function:
-    """`function` as machine code: compiled on the first call, kept on disk, run without the GIL.
+    """Return `function` as machine code, compiled on the first call, kept on disk, without the GIL.
 
     That of other packages is not kept: it is compiled in each process.
     Without fast-math and contraction, so that a * b + c is rounded twice on every CPU.
@@ -71,7 +71,7 @@ _INNER = {
 
 
 def inner(function: Function) -> Function:
-    """`function` for other kernels to call, not for Python, kept as a part of these.
+    """Return `function` for other kernels to call, not for Python, kept as a part of these.
 
     It cannot make arrays, so that no references are counted when arrays are passed.
     """
@@ -80,13 +80,13 @@ def inner(function: Function) -> Function:
 
 
 def leaf(function: Function) -> Function:
-    """Like `inner`, and always inlined into its caller."""
+    """Return like `inner`, and always inlined into its caller."""
     kernel: Function = _njit(**_INNER, forceinline=True)(function)
     return kernel
 
 
 def spliced(function: Function) -> Function:
-    """Like `leaf`, but inlined before types are inferred.
+    """Return like `leaf`, but inlined before types are inferred.
 
     For a few lines around a large function, which the compiler then goes over only once.
     """
@@ -117,7 +117,7 @@ def implements(name: Callable[..., Any], model: type) -> Callable[[Function], Fu
 
 
 def _states() -> list[tuple[int, int]]:
-    """Time of the last change and size of each file of the digest; empty if one is gone."""
+    """Return time of the last change and size of each file of the digest; empty if one is gone."""
     try:
         return [(state.st_mtime_ns, state.st_size) for state in map(os.stat, _FILES)]
     except OSError:
@@ -142,14 +142,14 @@ def _kernel_files() -> list[str]:
         for module, file in files.items()
     }
     pending = {module for module, names in imported.items() if __name__ in names}
-    found: set[str] = set()
+    reached: set[str] = set()
     while pending:
         module = pending.pop()
-        found.add(module)
+        reached.add(module)
         for name in imported[module]:
             # A folder stands for all of its files.
-            pending |= {other for other in files if f"{other}.".startswith(f"{name}.")} - found
-    return sorted(str(files[module]) for module in found)
+            pending |= {other for other in files if f"{other}.".startswith(f"{name}.")} - reached
+    return sorted(str(files[module]) for module in reached)
 
 
 def _module(file: Path) -> str:
@@ -163,12 +163,12 @@ _STAMP = _digest()
 
 
 def _is_ours(function: Callable[..., Any]) -> bool:
-    """Whether a function is in a file that the digest is of."""
+    """Return whether a function is in a file that the digest is of."""
     return function.__code__.co_filename in _FILES
 
 
 class _Locator(_CacheLocator):
-    """Where numba keeps the code of a function, and the stamp of what it was compiled from."""
+    """The place of a function's machine code, and a stamp of what it was compiled from."""
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
         self._py_file = file
@@ -213,7 +213,7 @@ class _KernelCache(FunctionCache):
         return str(cache_directory())
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The code for types of arguments, None if it must be compiled."""
+        """Return the code for types of arguments, None if it must be compiled."""
         # A file that changed since: this process may have imported other code than was digested.
         return super().load_overload(sig, target_context) if _states() == _STATES else None
 
@@ -232,7 +232,7 @@ class _KernelCache(FunctionCache):
 
 @cache
 def cache_directory() -> Path:
-    """The folder of the machine code of this state of the package.
+    """Return the folder of the machine code of this state of the package.
 
     It is in the folder that CHSEL_CACHE_DIR names, else in the user's cache folder, or where that
     cannot be written in a temporary one. Raises SettingError if others can write to it.
@@ -240,9 +240,9 @@ def cache_directory() -> Path:
     named = os.environ.get(CACHE_VARIABLE)
     user = getpass.getuser() if sys.platform == "win32" else os.getuid()  # users may be nameless
     usual = Path(AppDirs("chsel", appauthor=False).user_cache_dir, "kernels")
-    places = usual, Path(tempfile.gettempdir(), f"chsel-{user}")
-    for place in (Path(named).expanduser(),) if named else places:
-        folder = place / _STAMP
+    defaults = usual, Path(tempfile.gettempdir(), f"chsel-{user}")
+    for parent in (Path(named).expanduser(),) if named else defaults:
+        folder = parent / _STAMP
         try:
             for part in (*reversed(folder.parents), folder):
                 if not part.exists():
@@ -262,11 +262,11 @@ def cache_directory() -> Path:
             "folder that only you, and root, can write to (chmod go-w)"
         )
         break
-    raise SettingError(f"{CACHE_VARIABLE if named else 'the kernel folder'} is {place}, {wrong}")
+    raise SettingError(f"{CACHE_VARIABLE if named else 'the kernel folder'} is {parent}, {wrong}")
 
 
 def _others_can_write(folder: Path) -> Path | None:
-    """The first of a folder and its parents that others can put files in place of ours in."""
+    """Return the first of a folder and its parents in which others can replace our files."""
     for part in (folder, *folder.absolute().parents, *folder.resolve().parents):
         state = part.stat()
         sticky = part != folder and state.st_mode & stat.S_ISVTX  # others cannot replace ours
@@ -291,7 +291,7 @@ def _prune(used: Path) -> None:
 
 @contextmanager
 def watched(show: Callable[[int], None]) -> Iterator[None]:
-    """Within this context, call `show` with the number of kernels compiled, instead of the notice.
+    """Call `show` with the number of kernels compiled, in place of the notice, in this context.
 
     It is called before each compilation, and after it.
     """
@@ -317,7 +317,7 @@ class _CompilerWatch(event.Listener):
         self._usual = _config.SLP_VECTORIZE
 
     def on_start(self, event: Any) -> None:
-        """The compilation of a function, or of one that it calls, begins."""
+        """Take note that the compilation of a function, or of one that it calls, begins."""
         if not _is_kernel(event):
             return
         if self._depth == 0:
@@ -331,7 +331,7 @@ class _CompilerWatch(event.Listener):
         self._depth += 1
 
     def on_end(self, event: Any) -> None:
-        """The compilation of a function has ended."""
+        """Take note that the compilation of a function has ended."""
         if not _is_kernel(event):
             return
         self._depth -= 1

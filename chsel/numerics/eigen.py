@@ -64,14 +64,14 @@ def _rotate(work: FloatArray, vectors: FloatArray, p: int, q: int) -> bool:
 @inner
 def _sort(values: FloatArray, vectors: FloatArray) -> None:
     for i in range(1, len(values)):
-        place = i
-        while place > 0 and values[place - 1] > values[place]:
-            values[place - 1], values[place] = values[place], values[place - 1]
+        at = i
+        while at > 0 and values[at - 1] > values[at]:
+            values[at - 1], values[at] = values[at], values[at - 1]
             for row in range(len(values)):
-                x = vectors[row, place]
-                vectors[row, place] = vectors[row, place - 1]
-                vectors[row, place - 1] = x
-            place -= 1
+                x = vectors[row, at]
+                vectors[row, at] = vectors[row, at - 1]
+                vectors[row, at - 1] = x
+            at -= 1
 
 
 @inner

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import factorial
+from typing import Any
 
 import numpy as np
 
@@ -45,13 +46,15 @@ _ARCTANGENT = tuple(_alternating(k) / (2 * k + 1) for k in range(13, 0, -1))  # 
 _ARCTANGENT_HALF = 0.4636476090008061
 _ARCTANGENT_HALF_TAIL = 2.2698777452961687e-17
 
+_SIGNS = np.array([1, 1, -1, -1, 1, 1], dtype=np.float32)  # of sines in quarters of a turn
+
 _MANTISSA = (1 << 52) - 1
 _HEAD = ~((1 << 27) - 1)
 
 
 @compiled
 def _series(coefficients: tuple[float, ...], x: float) -> float:
-    """The polynomial with these coefficients, highest power first (Horner)."""
+    """Return the polynomial with these coefficients, highest power first (Horner)."""
     total = 0.0
     for coefficient in coefficients:
         total = total * x + coefficient
@@ -75,7 +78,7 @@ def _power_of_2(n: np.int64) -> float:
 
 @compiled
 def exp(x: float) -> float:
-    """e^x, from x = k ln 2 + r with |r| <= ln(2) / 2; rounded once where it is subnormal."""
+    """Return e^x, from x = k ln 2 + r with |r| <= ln(2) / 2; rounded once where it is subnormal."""
     if x != x or x > 710.0:
         return x + np.inf
     if x < -746.0:
@@ -93,7 +96,7 @@ def exp(x: float) -> float:
 
 @compiled
 def log(x: float) -> float:
-    """ln x, from x = 2^k m with sqrt(1/2) <= m < sqrt(2) and ln m = 2 artanh(s); NaN below 0."""
+    """Return ln x, from x = 2^k m with sqrt(1/2) <= m < sqrt(2); NaN below 0."""
     if x != x or x < 0.0:
         return np.nan
     if x == 0.0:
@@ -119,7 +122,7 @@ def log(x: float) -> float:
 
 @compiled
 def _reduced(x: float) -> tuple[float, float, np.int64]:
-    """r + tail = x - n pi/2 within pi/4 (Cody and Waite), and n, for |x| below 2^20."""
+    """Return r + tail = x - n pi/2 within pi/4 (Cody and Waite), and n, for |x| below 2^20."""
     n = np.rint(x * 0.6366197723675814)
     first = x - n * _HALF_PI_PARTS[0]
     second = first - n * _HALF_PI_PARTS[1]
@@ -133,14 +136,14 @@ def _reduced(x: float) -> tuple[float, float, np.int64]:
 
 @compiled
 def _difference_error(a: float, b: float, difference: float) -> float:
-    """(a - b) - difference, exactly, for the rounded difference of a and b (Knuth)."""
+    """Return (a - b) - difference, exactly, for the rounded difference of a and b (Knuth)."""
     taken = a - difference
     return (a - (difference + taken)) + (taken - b)
 
 
 @compiled
 def _remainder(x: float) -> float:
-    """x modulo _TURN for positive x, exactly: long division, whose every difference is exact."""
+    """Return x modulo _TURN for positive x, exactly: long division by exact differences."""
     step = _TURN
     while step <= 0.5 * x:
         step *= 2.0
@@ -153,7 +156,7 @@ def _remainder(x: float) -> float:
 
 @compiled
 def sine_cosine(x: float) -> tuple[float, float]:
-    """sin x and cos x of radians; NaN for infinity.
+    """Return sin x and cos x of radians; NaN for infinity.
 
     From 2^20 on, x is taken modulo the double nearest to 2 pi, an error below 4e-17 |x|, which is
     less than the rounding of x itself.
@@ -183,7 +186,7 @@ def sine_cosine(x: float) -> tuple[float, float]:
 
 @compiled
 def _quotient(n: float, d: float, d_tail: float) -> tuple[float, float]:
-    """q + tail = n / (d + d_tail), from the remainder by products of half-length factors."""
+    """Return q + tail = n / (d + d_tail), from the remainder by products of half-length factors."""
     q = n / d
     q_head, d_head = _from_bits(_bits(q) & _HEAD), _from_bits(_bits(d) & _HEAD)
     q_rest, d_rest = q - q_head, d - d_head
@@ -193,7 +196,7 @@ def _quotient(n: float, d: float, d_tail: float) -> tuple[float, float]:
 
 @compiled
 def _arctangent_of_ratio(small: float, big: float) -> tuple[float, float]:
-    """angle + tail = arctan(small / big) for 0 <= small <= big, in [0, pi/4].
+    """Return angle + tail = arctan(small / big) for 0 <= small <= big, in [0, pi/4].
 
     arctan(t) = arctan(c) + arctan((t - c) / (1 + c t)) with c the nearest of 0, 1/2 and 1.
     """
@@ -219,7 +222,7 @@ def _arctangent_of_ratio(small: float, big: float) -> tuple[float, float]:
 
 @compiled
 def arctangent(y: float, x: float) -> float:
-    """The angle of the point (x, y) in [-pi, pi] radians; signed zeros and infinities as in C."""
+    """Return the angle of (x, y) in [-pi, pi] radians; signed zeros and infinities as in C."""
     if x != x or y != y:
         return np.nan
     high, wide = abs(y), abs(x)
@@ -268,7 +271,7 @@ def _fill_arctangents(y: FloatArray, x: FloatArray, out: FloatArray) -> None:
 def _filled(
     fill: Callable[..., None], *arguments: FloatArray | float, outputs: int = 1
 ) -> list[FloatArray]:
-    """The arrays that a kernel fills, of the shape that its arguments broadcast to."""
+    """Return the arrays that a kernel fills, of the shape that its arguments broadcast to."""
     arrays = np.broadcast_arrays(*(np.asarray(each, dtype=np.float64) for each in arguments))
     out = [np.empty(arrays[0].size) for _ in range(outputs)]
     fill(*(array.flatten() for array in arrays), *out)
@@ -276,21 +279,34 @@ def _filled(
 
 
 def sines_cosines(x: FloatArray | float) -> tuple[FloatArray, FloatArray]:
-    """sin x and cos x, each of the shape of x."""
+    """Return sin x and cos x, each of the shape of x."""
     sine, cosine = _filled(_fill_sines_cosines, x, outputs=2)
     return sine, cosine
 
 
+def sines_cosines_of_turns(shares: Any) -> tuple[Any, Any]:
+    """Return sines and cosines of shares of a turn in 32 bits, to about seven digits (Taylor)."""
+    quarters = 4 * shares
+    nearest = (quarters + np.float32(0.5)).astype(np.int32)
+    r = (quarters - nearest.astype(np.float32)) * np.float32(0.5 * np.pi)
+    z = r * r
+    sine = r + r * z * ((-1 / 5040 * z + 1 / 120) * z - 1 / 6)
+    cosine = 1 + z * (((1 / 40320 * z - 1 / 720) * z + 1 / 24) * z - 1 / 2)
+    odd = (nearest & 1).astype(np.bool_)
+    a, b = np.where(odd, cosine, sine), np.where(odd, sine, cosine)
+    return a * _SIGNS.take(nearest), b * _SIGNS.take(nearest + 1)
+
+
 def exps(x: FloatArray | float) -> FloatArray:
-    """e^x, of the shape of x."""
+    """Return e^x, of the shape of x."""
     return _filled(_fill_exps, x)[0]
 
 
 def logs(x: FloatArray | float) -> FloatArray:
-    """ln x, of the shape of x."""
+    """Return ln x, of the shape of x."""
     return _filled(_fill_logs, x)[0]
 
 
 def arctangents(y: FloatArray | float, x: FloatArray | float) -> FloatArray:
-    """The angles of the points (x, y), of the shape that x and y broadcast to."""
+    """Return the angles of the points (x, y), of the shape that x and y broadcast to."""
     return _filled(_fill_arctangents, y, x)[0]

@@ -15,7 +15,7 @@ import numpy as np
 
 from chsel.errors import PointsError
 from chsel.numerics.arrays import FloatArray, IntArray, read_only, scratch
-from chsel.numerics.cell_set import bounds_of, triple
+from chsel.numerics.cell_set import bounds_of, nearest_node, triple
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import Triple
 
@@ -42,7 +42,7 @@ class PointTree(NamedTuple):
     order: IntArray  # (N,) indices that the points had before
     blocks: Any  # (4 LANES B,) x of each child, then y, z, radius; NaN where there is none; float32
     first: Any  # (B,) the first child of each block; int32
-    places: Any  # (B,) where blocks have the x of each block; int32
+    offsets: Any  # (B,) where blocks have the x of each block; int32
     roots: int  # blocks without a parent, at most LANES
     depth: int  # levels above the packets
     packets: int  # P
@@ -52,7 +52,7 @@ class PointTree(NamedTuple):
 
 
 def point_tree(points: FloatArray, spacing: float) -> PointTree:
-    """The tree of points (N, 3) about `spacing` metres apart.
+    """Return the tree of points (N, 3) about `spacing` metres apart.
 
     Points in one cell of the Morton order stay in their order. Raises PointsError if the extent
     of the points is not finite.
@@ -79,7 +79,7 @@ def point_tree(points: FloatArray, spacing: float) -> PointTree:
         order=order,
         blocks=np.full(4 * LANES * len(first), np.float32(np.nan)),
         first=first,
-        places=np.zeros(len(first), dtype=np.int32),
+        offsets=np.zeros(len(first), dtype=np.int32),
         roots=len(levels[0]),
         depth=len(levels) - 1,
         packets=len(levels[-1]),
@@ -92,7 +92,7 @@ def point_tree(points: FloatArray, spacing: float) -> PointTree:
 
 
 def _levels(keys: IntArray, bits: int) -> list[Any]:
-    """For each level, the uppermost first, the first child of each block, of those below.
+    """Return for each level, the uppermost first, the first child of each block, of those below.
 
     The cells of each level are the finest that make its blocks full enough.
     """
@@ -120,21 +120,19 @@ def _begin_blocks(keys, bits, begins):
 
 @compiled
 def _fill_keys(points, lower, inverse, extent, index_bits, keys):
-    """Interleaved bits of the points' cells on the finest level, then the points' indices."""
+    """Fill keys: interleaved bits of the points' cells on the finest level, then their indices."""
     spread = np.empty(int(np.rint(extent * inverse)) + 1, dtype=np.int64)
     for cell in range(len(spread)):
         spread[cell] = _spread_bits(cell) << index_bits
-    x, y, z = lower[0], lower[1], lower[2]
     for n in range(len(points)):
-        i = np.uint64(np.int32(np.rint((points[n, 0] - x) * inverse)))
-        j = np.uint64(np.int32(np.rint((points[n, 1] - y) * inverse)))
-        k = np.uint64(np.int32(np.rint((points[n, 2] - z) * inverse)))
+        x, y, z = nearest_node(lower, inverse, points[n, 0], points[n, 1], points[n, 2])
+        i, j, k = np.uint64(np.int32(x)), np.uint64(np.int32(y)), np.uint64(np.int32(z))
         keys[n] = spread[i] | spread[j] << 1 | spread[k] << 2 | n
 
 
 @leaf
 def _spread_bits(cell):
-    """Two zeros between each of 21 bits."""
+    """Return two zeros between each of 21 bits."""
     cell = (cell | cell << 32) & 0x1F00000000FFFF
     cell = (cell | cell << 16) & 0x1F0000FF0000FF
     cell = (cell | cell << 8) & 0x100F00F00F00F00F
@@ -144,7 +142,7 @@ def _spread_bits(cell):
 
 @compiled
 def _fill_blocks(points, tree):
-    """Fill PointTree.points, blocks and places, axis by axis, from the points up."""
+    """Fill PointTree.points, blocks and offsets, axis by axis, from the points up."""
     blocks, first, order, count = tree.blocks, tree.first, tree.order, len(tree.first)
     low, high, squares = np.empty(count), np.empty(count), np.zeros(count)  # of boxes
     for axis in range(3):
@@ -158,7 +156,7 @@ def _fill_blocks(points, tree):
                     a = b = placed[child] = points[order[child], axis]
                 else:
                     a, b = low[child], high[child]
-                    tree.places[child] = at - np.uint64(LANES * axis)
+                    tree.offsets[child] = at - np.uint64(LANES * axis)
                     radius = np.sqrt(squares[child]) * (1.0 + 1e-6)
                     blocks[at + np.uint64(LANES * (3 - axis))] = np.float32(radius)
                 blocks[at] = np.float32(0.5 * a + 0.5 * b - origin)
@@ -173,9 +171,9 @@ class NearPoints(NamedTuple):
     """Scratch for P lists of the packets of points that are near a set of cells."""
 
     x: Any  # (P C + 8,) of spheres around packets, C for each list, as in PointTree.blocks; float32
-    y: Any
-    z: Any
-    radius: Any
+    y: Any  # (P C + 8,); float32
+    z: Any  # (P C + 8,); float32
+    radius: Any  # (P C + 8,); float32
     kept: Any  # (P C + 8,) which packets they are, ascending, int32
     number: IntArray  # (P,) how many packets each has
     rows: Any  # (4, S) nodes, or points, that are looked at: x, y, z, radius; float32
@@ -186,7 +184,7 @@ class NearPoints(NamedTuple):
 
 
 def near_points_for(tree: PointTree, lists: int) -> NearPoints:
-    """Scratch for so many lists of the points of a tree."""
+    """Return scratch for so many lists of the points of a tree."""
     packets = tree.packets
     room = lists * packets + LANES  # vectors reach beyond the last list
     x, y, z, radius = (np.empty(room, dtype=np.float32) for _ in range(4))
@@ -200,7 +198,7 @@ def near_points_for(tree: PointTree, lists: int) -> NearPoints:
 
 @leaf
 def to_cells(tree, box, move):
-    """The map from a tree's 32-bit coordinates to those of a grid, in cells that begin at 0.
+    """Return the map from a tree's 32-bit coordinates to those of a grid, in cells that begin at 0.
 
     Also by how many metres rounding may move a point on the way; negative if by too many.
     """
@@ -241,11 +239,11 @@ def gather(tree, cells, to_cell, slack, near, n):
     begin = np.uint64(n * tree.packets)
     for at in range(np.uint64(count)):
         packet, to = nodes[at], begin + at
-        place = np.uint64(tree.places[np.uint64(packet)])
+        offset = np.uint64(tree.offsets[np.uint64(packet)])
         near.kept[to] = packet
-        near.x[to], near.y[to] = tree.blocks[place], tree.blocks[place + _ROW]
-        near.z[to] = tree.blocks[place + np.uint64(2) * _ROW]
-        near.radius[to] = tree.blocks[place + np.uint64(3) * _ROW]
+        near.x[to], near.y[to] = tree.blocks[offset], tree.blocks[offset + _ROW]
+        near.z[to] = tree.blocks[offset + np.uint64(2) * _ROW]
+        near.radius[to] = tree.blocks[offset + np.uint64(3) * _ROW]
     near.number[n] = count
 
 
@@ -321,7 +319,7 @@ def _locate_spheres(xs, ys, zs, radii, begin, count, move, box, slack, near):
 
 @leaf
 def _last_centres(box):
-    """The centre of the last cell, in cells."""
+    """Return the centre of the last cell, in cells."""
     p, q, r = box.most
     return np.float32(p + 0.5), np.float32(q + 0.5), np.float32(r + 0.5)
 
@@ -340,10 +338,10 @@ def select(tree, cells, to_cell, rounding, near, n):
     packets = _keep(near.kept, begin, count, steps, near)
     x, y, z = near.rows[0], near.rows[1], near.rows[2]
     for at in range(np.uint64(packets)):
-        place, to = np.uint64(nodes[at]) * _BLOCK, at * _ROW
-        _copy(tree.blocks, place, x, to)
-        _copy(tree.blocks, place + _ROW, y, to)
-        _copy(tree.blocks, place + np.uint64(2) * _ROW, z, to)
+        offset, to = np.uint64(nodes[at]) * _BLOCK, at * _ROW
+        _copy(tree.blocks, offset, x, to)
+        _copy(tree.blocks, offset + _ROW, y, to)
+        _copy(tree.blocks, offset + np.uint64(2) * _ROW, z, to)
     _locate_points(x, y, z, packets, to_cell, cells, rounding, where)
     total = np.uint64(0)
     for at in range(np.uint64(packets)):

@@ -25,10 +25,10 @@ _NO_MATRIX: Matrix = (0.0,) * 9
 class SpaceConstants(NamedTuple):
     """A search space as kernels take it: SE(3), or planar with the plane's constants (SE2Space)."""
 
-    planar: bool = False
+    planar: bool = False  # whether it is SE(2)
     axis: Triple = (0.0, 0.0, 0.0)  # a, of unit length
-    e_u: Triple = (0.0, 0.0, 0.0)
-    e_v: Triple = (0.0, 0.0, 0.0)
+    e_u: Triple = (0.0, 0.0, 0.0)  # unit vector in the plane
+    e_v: Triple = (0.0, 0.0, 0.0)  # the other one, across e_u
     resting: Matrix = _NO_MATRIX  # R_0
     turning: Matrix = _NO_MATRIX  # hat(a) R_0
     turning_squared: Matrix = _NO_MATRIX  # hat(a)^2 R_0
@@ -36,14 +36,14 @@ class SpaceConstants(NamedTuple):
 
 
 def matrix_of(rotation: FloatArray) -> Matrix:
-    """A matrix (3, 3) as nine numbers."""
+    """Return a matrix (3, 3) as nine numbers."""
     a, b, c, d, e, f, g, h, i = (float(value) for value in rotation.reshape(-1))
     return a, b, c, d, e, f, g, h, i
 
 
 @leaf
 def decode(space, x):
-    """The pose of a search vector."""
+    """Return the pose of a search vector."""
     if space.planar:
         return _planar(space, x)
     p, q, r, u, v, w = _gram_schmidt(x)[:6]
@@ -52,7 +52,7 @@ def decode(space, x):
 
 @leaf
 def _gram_schmidt(x):
-    """Two rows made orthonormal (Zhou et al.; CHSEL, Sec. IV-B): b1 and b2, |a1|, b1 . a2, |u|."""
+    """Return two rows made orthonormal (Zhou et al.; Sec. IV-B): b1 and b2, |a1|, b1 . a2, |u|."""
     a = _length(x[0], x[1], x[2])
     p, q, r = x[0] / a, x[1] / a, x[2] / a
     along = p * x[3] + q * x[4] + r * x[5]
@@ -63,7 +63,7 @@ def _gram_schmidt(x):
 
 @leaf
 def _planar(space, x):
-    """R = Rot(a, theta) R_0 by Rodrigues' formula, t = o a + u e_u + v e_v."""
+    """Return R = Rot(a, theta) R_0 by Rodrigues' formula, t = o a + u e_u + v e_v."""
     sine, cosine = sine_cosine(x[0])
     turn, squared, rest = space.turning, space.turning_squared, space.resting
     back = 1.0 - cosine
@@ -94,7 +94,7 @@ def pull_back(space, x, by_pose, gradient):
 
 @leaf
 def _pull_back_spatial(x, by_pose, gradient):
-    """Back through b3 = b1 x b2, b2 = u / |u|, u = a2 - (b1 . a2) b1, b1 = a1 / |a1|."""
+    """Fill the gradient by b3 = b1 x b2, b2 = u / |u|, u = a2 - (b1 . a2) b1, b1 = a1 / |a1|."""
     p, q, r, u, v, w, a, along, b = _gram_schmidt(x)
     d, e, f = by_pose[6], by_pose[7], by_pose[8]
     p2 = by_pose[3] + (e * r - f * q)
@@ -132,7 +132,7 @@ def _pull_back_planar(space, x, by_pose, gradient):
 
 @leaf
 def finite(pose):
-    """Whether the squares of a pose's numbers are finite."""
+    """Return whether the squares of a pose's numbers are finite."""
     total = 0.0
     for value in pose:
         total += value * value
@@ -141,7 +141,7 @@ def finite(pose):
 
 @leaf
 def all_finite(vector):
-    """Whether a vector holds neither infinity nor NaN."""
+    """Return whether a vector holds neither infinity nor NaN."""
     finite = True
     for x in vector:
         finite &= np.isfinite(x)
@@ -150,7 +150,7 @@ def all_finite(vector):
 
 @leaf
 def rigid(pose):
-    """Whether the rows of a pose's rotation are orthonormal up to rounding."""
+    """Return whether the rows of a pose's rotation are orthonormal up to rounding."""
     worst = 0.0
     for i in range(3):
         for j in range(i + 1):
@@ -162,7 +162,7 @@ def rigid(pose):
 
 @leaf
 def pose_at(poses, n):
-    """Row n of poses (B, 12)."""
+    """Return row n of poses (B, 12)."""
     a, b, c, d = poses[n, 0], poses[n, 1], poses[n, 2], poses[n, 3]
     e, f, g, h = poses[n, 4], poses[n, 5], poses[n, 6], poses[n, 7]
     return a, b, c, d, e, f, g, h, poses[n, 8], poses[n, 9], poses[n, 10], poses[n, 11]
@@ -170,7 +170,7 @@ def pose_at(poses, n):
 
 @leaf
 def moved(pose, x, y, z):
-    """R p + t of a point p = x, y, z."""
+    """Return R p + t of a point p = x, y, z."""
     return (
         pose[0] * x + pose[1] * y + pose[2] * z + pose[9],
         pose[3] * x + pose[4] * y + pose[5] * z + pose[10],
@@ -180,7 +180,7 @@ def moved(pose, x, y, z):
 
 @leaf
 def origin_within(pose, low, high):
-    """Whether the object's origin, -R^T t in the world, lies in a box."""
+    """Return whether the object's origin, -R^T t in the world, lies in a box."""
     x = -(pose[0] * pose[9] + pose[3] * pose[10] + pose[6] * pose[11])
     y = -(pose[1] * pose[9] + pose[4] * pose[10] + pose[7] * pose[11])
     z = -(pose[2] * pose[9] + pose[5] * pose[10] + pose[8] * pose[11])
@@ -189,7 +189,7 @@ def origin_within(pose, low, high):
 
 @leaf
 def turned(pose, x, y, z):
-    """R v of a vector v = x, y, z."""
+    """Return R v of a vector v = x, y, z."""
     return (
         pose[0] * x + pose[1] * y + pose[2] * z,
         pose[3] * x + pose[4] * y + pose[5] * z,
@@ -199,7 +199,7 @@ def turned(pose, x, y, z):
 
 @leaf
 def turned_back(pose, x, y, z):
-    """R^T v of a vector v = x, y, z."""
+    """Return R^T v of a vector v = x, y, z."""
     return (
         pose[0] * x + pose[3] * y + pose[6] * z,
         pose[1] * x + pose[4] * y + pose[7] * z,
@@ -209,7 +209,7 @@ def turned_back(pose, x, y, z):
 
 @leaf
 def composed(left, right):
-    """The pose that moves by `right`, then by `left`."""
+    """Return the pose that moves by `right`, then by `left`."""
     a, d, g = turned(left, right[0], right[3], right[6])
     b, e, h = turned(left, right[1], right[4], right[7])
     c, f, i = turned(left, right[2], right[5], right[8])
@@ -219,7 +219,7 @@ def composed(left, right):
 
 @leaf
 def inverted(pose):
-    """The inverse of a rigid pose: R^T, -R^T t."""
+    """Return the inverse of a rigid pose: R^T, -R^T t."""
     a, b, c, d, e, f, g, h, i, x, y, z = pose
     u, v, w = turned_back(pose, x, y, z)
     return a, d, g, b, e, h, c, f, i, -u, -v, -w

@@ -77,7 +77,7 @@ def require_threads(name: str, count: object) -> None:
 
 
 def thread_count() -> int:
-    """How many threads kernels use: what was set here, else what torch uses where it is imported.
+    """Return the number of threads of kernels: set here, else as torch has it if imported.
 
     Else OMP_NUM_THREADS, or one for each core that this process may use.
     """

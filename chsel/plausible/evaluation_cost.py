@@ -8,7 +8,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import Box, CellSet, Places, box_of, locate, places_for
+from chsel.numerics.cell_set import (
+    Box,
+    CellSet,
+    Places,
+    box_of,
+    locate,
+    nearest_node,
+    places_for,
+    voxels_of,
+)
 from chsel.numerics.compiler import compiled, inner, leaf, spliced
 from chsel.numerics.near_points import (
     NearPoints,
@@ -45,17 +54,17 @@ Pose = tuple[float, ...]
 
 
 class Divisors(NamedTuple):
-    """What the sums over each class of points are divided by."""
+    """Divisors of the sums over each class of points."""
 
-    free: float
-    occupied: float
-    known: float
+    free: float  # of the count of free points
+    occupied: float  # of the count of occupied points
+    known: float  # of the sum over known points
 
 
 class EvaluationModel(NamedTuple):
-    """All that the evaluation cost of a pose depends on."""
+    """Data of the evaluation cost, but the pose."""
 
-    field: DistanceField
+    field: DistanceField  # of the object
     tree: PointTree  # of the free points
     cells: CellSet  # of the object in which a free point can violate
     occupied: FloatArray  # (3, K), world
@@ -63,7 +72,7 @@ class EvaluationModel(NamedTuple):
     known_sdf: FloatArray  # (M,), m
     level: float  # free points violate at s <= level, occupied ones at s >= -level
     violation: float  # c_max
-    divisors: Divisors
+    divisors: Divisors  # of the three sums
     inside: FloatArray  # (3, I) points in the object, by which most violations are found early
     voxels: Box  # around the free points
     point_in: Any  # (voxels,) number of a free point in each, -1 for none; int32
@@ -101,7 +110,7 @@ class EvaluationCost:
         )
 
     def evaluate(self, object_from_world: FloatArray, *, limit: float = np.inf) -> FloatArray:
-        """Costs (B,) of transforms (B, 4, 4); infinite for those not below `limit`."""
+        """Return costs (B,) of transforms (B, 4, 4); infinite for those not below `limit`."""
         poses = Poses.of(object_from_world)
         costs = np.empty(len(poses))
         run = partial(costs_below, self.model, poses.numbers, limit, costs)
@@ -109,12 +118,12 @@ class EvaluationCost:
         return costs
 
     def at(self, world_from_object: FloatArray) -> float:
-        """The cost of one pose (4, 4)."""
+        """Return the cost of one pose (4, 4)."""
         return float(self.evaluate(inverse(world_from_object)[None])[0])
 
 
 def _inside(sdf: SdfGrid, level: float) -> FloatArray:
-    """Points (3, I) inside of the object, far apart from each other."""
+    """Return points (3, I) inside of the object, far apart from each other."""
     nodes = np.argwhere(sdf.values <= level)
     nodes = nodes[:: max(1, len(nodes) // _MOST_CANDIDATES)]
     points = sdf.origin + nodes * sdf.resolution
@@ -122,29 +131,29 @@ def _inside(sdf: SdfGrid, level: float) -> FloatArray:
 
 
 def _voxels(tree: PointTree, resolution: float) -> tuple[Box, Any]:
-    """The voxels of free points with an empty layer around them, and a free point of each."""
+    """Return the voxels of free points with an empty layer around, and a free point of each."""
     free = tree.points.T
     if len(free) == 0 or voxels_spanned(free, resolution) > _MOST_VOXELS:
         return box_of(np.zeros(3), 1.0, (1, 1, 1)), np.full(1, -1, dtype=np.int32)
     first = free.min(axis=0) - resolution
-    voxels = np.rint((free - first) / resolution).astype(np.int64)
+    voxels = voxels_of(free, first, resolution)
     point_in = np.full(voxels.max(axis=0) + 2, -1, dtype=np.int32)
     point_in[tuple(voxels.T)] = np.arange(len(free))
     return box_of(first, resolution, point_in.shape), point_in.reshape(-1)
 
 
 class EvaluationScratch(NamedTuple):
-    """Of one thread: the free points that are looked up, and where points lie."""
+    """Scratch of one thread: free points that are looked up, and places of points."""
 
-    near: NearPoints
+    near: NearPoints  # free points that are looked up
     x: FloatArray  # (S,) metres, world
-    y: FloatArray
-    z: FloatArray
-    places: Places
+    y: FloatArray  # (S,)
+    z: FloatArray  # (S,)
+    places: Places  # of these points
 
 
 def scratch_for(model: EvaluationModel) -> EvaluationScratch:
-    """EvaluationScratch for one thread."""
+    """Return EvaluationScratch for one thread."""
     points = model.tree.points, model.occupied, model.known
     size = max(_MOST_DISTINCT, *(array.shape[1] for array in points))
     near, (x, y, z) = near_points_for(model.tree, 1), np.empty((3, size))
@@ -160,7 +169,7 @@ def costs_below(model, poses, limit, out, first, last, scratch):
 
 @inner
 def cost_below(model, pose, limit, scratch):
-    """The evaluation cost of a pose; infinite if it is not below the limit."""
+    """Return the evaluation cost of a pose; infinite if it is not below the limit."""
     if not finite(pose):
         return np.inf
     total = _known_sum(model, pose, scratch)
@@ -184,7 +193,7 @@ def _cost(model: EvaluationModel, free: int, occupied: int, total: float) -> flo
 
 @spliced
 def _known_sum(model: EvaluationModel, pose: Pose, scratch: EvaluationScratch) -> float:
-    """sum |s - v| over the points of known signed distance, in their order."""
+    """Return sum |s - v| over the points of known signed distance, in their order."""
     xs, ys, zs, total = model.known[0], model.known[1], model.known[2], 0.0
     locate(pose, model.field.box, xs, ys, zs, scratch.places, len(xs))
     for n in range(len(xs)):
@@ -205,14 +214,15 @@ def _occupied_count(model: EvaluationModel, pose: Pose, scratch: EvaluationScrat
 
 @spliced
 def _may_be_below(model, pose, occupied, total, limit, scratch):
-    """False if the free points near some points inside of the object violate too often."""
+    """Return False if the free points near some points inside of the object violate too often."""
     voxels, inside, points, hits = model.voxels, model.inside, model.tree.points, 0
     for n in range(inside.shape[1]):
         x, y, z = inside[0, n] - pose[9], inside[1, n] - pose[10], inside[2, n] - pose[11]
         x, y, z = turned_back(pose, x, y, z)
-        i = min(max(np.rint((x - voxels.first[0]) * voxels.inverse), 0.0), voxels.most[0])
-        j = min(max(np.rint((y - voxels.first[1]) * voxels.inverse), 0.0), voxels.most[1])
-        k = min(max(np.rint((z - voxels.first[2]) * voxels.inverse), 0.0), voxels.most[2])
+        i, j, k = nearest_node(voxels.first, voxels.inverse, x, y, z)
+        i = min(max(i, 0.0), voxels.most[0])
+        j = min(max(j, 0.0), voxels.most[1])
+        k = min(max(k, 0.0), voxels.most[2])
         point = model.point_in[int(i * voxels.across + j * voxels.along + k)]
         if point >= 0 and hits < _MOST_DISTINCT and _is_new(scratch.near.hits, hits, point):
             scratch.x[0], scratch.y[0] = points[0, point], points[1, point]
@@ -236,7 +246,7 @@ def _is_new(hits: Any, count: int, point: int) -> bool:
 
 @leaf
 def _violates(model: EvaluationModel, places: Places, n: int) -> bool:
-    """Whether a free point at the n-th of the places is inside; nothing beyond the grid is."""
+    """Return whether a free point at the n-th of the places is inside; none beyond the grid is."""
     if model.cells.steps[places.cell[n]] > 0 or places.beyond[n] > 0.0:
         return False
     return distance_in_box(model.field, places, n)[0] <= model.level

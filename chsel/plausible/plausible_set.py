@@ -76,7 +76,7 @@ class PlausibleSet:
     index: IntArray  # (G,), all members on the grid, see PoseGrid, ascending
     index_cost: FloatArray  # (G,)
     true_cost: float  # C(X*)
-    settings: PlausibleSettings
+    settings: PlausibleSettings  # its definition
     seed: int  # of the rotations
     points_digest: str  # of the known points to which the set belongs
     sdf_digest: str  # of their object's SDF grid
@@ -92,7 +92,7 @@ class PlausibleSet:
         return digest(*(getattr(self, name) for name in _ARRAYS))
 
     def with_members(self, world_from_object: FloatArray, cost: FloatArray) -> PlausibleSet:
-        """The set with members off the grid (N, 4, 4), and their costs (N,), added."""
+        """Return the set with members off the grid (N, 4, 4), and their costs (N,), added."""
         return replace(
             self,
             world_from_object=np.concatenate([self.world_from_object, world_from_object]),
@@ -104,7 +104,7 @@ class PlausibleSet:
 def plausible_set(
     problem: RegistrationProblem, world_from_object: FloatArray, settings: PlausibleSettings
 ) -> PlausibleSet:
-    """The plausible set of a problem around the true pose (4, 4).
+    """Return the plausible set of a problem around the true pose (4, 4).
 
     What the true pose itself violates counts into C(X*), so that as much is allowed to others.
     Raises EvaluationError if there are more than MOST_MEMBERS members.
@@ -138,14 +138,14 @@ def plausible_set(
 
 
 def rotation_seed(problem: RegistrationProblem, settings: PlausibleSettings) -> int:
-    """The seed of the rotations that are looked at."""
+    """Return the seed of the rotations that are looked at."""
     return problem.key.seed if settings.grid.seed is None else settings.grid.seed
 
 
 def _with_modes(
     members: PlausibleSet, cost: EvaluationCost, grid: PoseGrid, limit: float
 ) -> PlausibleSet:
-    """With members in modes that the grid passes by, in place of others if they are too many.
+    """Return the set with members in modes that the grid passes by, in place of others if too many.
 
     Between the poses of the grid, a mode that is a few millimetres thick fits many times. But
     around it poses nearly are members: the grid is scanned for those, and they climb from there.
@@ -173,7 +173,7 @@ def _with_modes(
 
 
 def _filled(members: PlausibleSet, cost: EvaluationCost, limit: float) -> PlausibleSet:
-    """With members off the grid around others, if there are too few, or too few in its modes.
+    """Return the set with members off the grid around others, where those of the grid are too few.
 
     Rounds of normal steps in position and rotation vector from members, those of earlier rounds
     among them, so that the search walks along the set; the steps get shorter after a round
@@ -206,12 +206,12 @@ def _filled(members: PlausibleSet, cost: EvaluationCost, limit: float) -> Plausi
         if n >= _ROUNDS // 2 and len(costs) >= _ENOUGH * wanted:
             break
     places = _places(pool, cost.problem.sdf)
-    chosen = np.sort(farthest_points(places, known + wanted, given=known))[known:]
+    chosen = np.sort(farthest_points(places, known + wanted, chosen_first=known))[known:]
     return members.with_members(pool[chosen], costs[chosen - known])
 
 
 def random_subset(count: int, most: int, stream: np.random.Generator) -> IntArray:
-    """At most so many of the numbers below `count`, drawn at random, ascending."""
+    """Return at most so many of the numbers below `count`, drawn at random, ascending."""
     if count <= most:
         return np.arange(count)
     drawn = uniforms(stream, 0.0, 1.0, count)
@@ -219,7 +219,7 @@ def random_subset(count: int, most: int, stream: np.random.Generator) -> IntArra
 
 
 def stepped(poses: FloatArray, shifts: FloatArray, turns: FloatArray) -> FloatArray:
-    """Poses (..., 4, 4) moved by shifts (..., 3), turned about their origins by vectors (..., 3).
+    """Return poses (..., 4, 4) shifted (..., 3), and turned about their origins (..., 3).
 
     The latter are rotation vectors about the axes of the world.
     """
@@ -228,13 +228,13 @@ def stepped(poses: FloatArray, shifts: FloatArray, turns: FloatArray) -> FloatAr
 
 
 def _places(poses: FloatArray, sdf: SdfGrid) -> FloatArray:
-    """Vectors (N, 12) whose distances compare poses (N, 4, 4): position, and scaled rotation."""
+    """Return vectors (N, 12) that compare poses (N, 4, 4): position, and scaled rotation."""
     lever = sdf.diameter / 4.0
     return np.concatenate([poses[:, :3, 3], lever * poses[:, :3, :3].reshape(-1, 9)], axis=1)
 
 
 def _nearly_plausible(grid: PoseGrid, cost: EvaluationCost, members: PlausibleSet) -> FloatArray:
-    """Poses (N, 4, 4) of a grid to climb from, of as many of its rotations as give enough.
+    """Return poses (N, 4, 4) of a grid to climb from, of as many of its rotations as give enough.
 
     They cost at most `distance` more than the true pose: the mean over known points, and a
     millimetre for every point that is deeper on the wrong side than is allowed by `depth`.
@@ -259,7 +259,7 @@ def _nearly_plausible(grid: PoseGrid, cost: EvaluationCost, members: PlausibleSe
 def _climbed(
     cost: EvaluationCost, starts: FloatArray, limit: float, seed: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Members (M, 4, 4) that are reached from poses (N, 4, 4), world_from_object, and their costs.
+    """Return members (M, 4, 4) reached from poses (N, 4, 4), world_from_object, and costs (M,).
 
     Down the gradient of the relaxed cost, then by random steps that lower C itself, ever shorter
     ones where none does; after every round some that still cost the most are given up.
@@ -289,7 +289,7 @@ def _climbed(
 
 
 def _descended(cost: EvaluationCost, starts: FloatArray) -> FloatArray:
-    """Poses (N, 4, 4) after some iterations of Adam on the relaxed cost, world_from_object."""
+    """Return poses (N, 4, 4), world_from_object, after iterations of Adam on the relaxed cost."""
     smooth = CostSettings(
         penetration_tolerance=-cost.settings.tolerance,
         occupied_scale=_SCALE if cost.settings.occupied else 0.0,
@@ -307,7 +307,7 @@ def _descended(cost: EvaluationCost, starts: FloatArray) -> FloatArray:
 
 
 def _far_from(members: PlausibleSet, poses: FloatArray, sdf: SdfGrid, most: int) -> IntArray:
-    """Which poses (N, 4, 4) are far from members and each other, the farthest first."""
+    """Return indices of poses (N, 4, 4) far from members and each other, the farthest first."""
     assert members.settings.modes is not None
     least = SQUARE_MILLIMETRES * members.settings.modes.separation**2
     points = surface_points(sdf, _SURFACE_POINTS, plausible_stream(members.seed, _MODE_STREAM + 1))
@@ -323,7 +323,7 @@ def _far_from(members: PlausibleSet, poses: FloatArray, sdf: SdfGrid, most: int)
 
 
 def plausible_path(folder: Path, problem: RegistrationProblem, settings: PlausibleSettings) -> Path:
-    """Where the set of a problem is kept: FOLDER/<points digest>_<definition digest>.npz."""
+    """Return the path of a problem's set: FOLDER/<points digest>_<definition digest>.npz."""
     seed = rotation_seed(problem, settings)
     return folder / _name(problem.points.digest, settings, seed, problem.sdf.digest)
 
@@ -353,7 +353,7 @@ def load_plausible(
     *,
     world_from_object: FloatArray | None = None,
 ) -> PlausibleSet | None:
-    """The set of a problem by a definition, around this true pose if given; None if there is none.
+    """Return the stored set of a problem by a definition, around a true pose if given; else None.
 
     Raises EvaluationError for a file under that name that is damaged, of other points or another
     definition, or around another true pose.
@@ -373,7 +373,7 @@ def load_plausible(
 
 
 def read_plausible(path: Path) -> PlausibleSet:
-    """The set in a file, its digest checked. Raises EvaluationError if it is damaged."""
+    """Return the set in a file, its digest checked. Raises EvaluationError if it is damaged."""
     try:
         arrays = read_npz(path, most_bytes=MOST_BYTES, error=EvaluationError)
         settings = json.loads(str(arrays["settings"]))

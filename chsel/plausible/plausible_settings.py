@@ -1,4 +1,4 @@
-"""What the plausible set is: the cost that defines it, and the grid of poses that is scanned."""
+"""Definition of the plausible set: its cost, and the grid of poses that is scanned."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ class EvaluationCostSettings(CheckedSettings):
 class Offsets:
     """Offsets in the world, metres: along x, y, z pieces (first, last, count) of even spacing."""
 
-    x: Axis = ((-0.1, 0.15, 15),)
-    y: Axis = ((-0.2, 0.2, 15),)
-    z: Axis = ((0.0, 0.1, 15),)
+    x: Axis = ((-0.1, 0.15, 15),)  # pieces along x
+    y: Axis = ((-0.2, 0.2, 15),)  # pieces along y
+    z: Axis = ((0.0, 0.1, 15),)  # pieces along z
 
     def __post_init__(self) -> None:
         counts = [sum(piece[2] for piece in axis) for axis in (self.x, self.y, self.z)]
@@ -60,7 +60,7 @@ class Offsets:
         require_at_most("the number of offsets", math.prod(counts), MOST_POSITIONS)
 
     def points(self) -> FloatArray:
-        """All offsets (P, 3), those along z fastest."""
+        """Return the offsets (P, 3), those along z fastest."""
         axes = [
             np.concatenate([np.linspace(first, last, count) for first, last, count in axis])
             for axis in (self.x, self.y, self.z)
@@ -83,7 +83,7 @@ class PoseGridSettings(CheckedSettings):
 
 @dataclass(frozen=True)
 class ModeSearchSettings(CheckedSettings):
-    """How members are sought in modes between the poses of the grid.
+    """Search for members in modes between the poses of the grid.
 
     Poses of the grid climb if their mean over known points is less than `distance` above the true
     pose's, and few points are deeper than `depth` on the wrong side.
@@ -110,7 +110,7 @@ class PlausibleSettings(CheckedSettings):
 
     @property
     def text(self) -> str:
-        """All settings as JSON."""
+        """The settings as JSON."""
         return json.dumps(settings_mapping(self), sort_keys=True)
 
     @property
@@ -120,7 +120,7 @@ class PlausibleSettings(CheckedSettings):
 
 
 def plausible_settings(definition: str, epsilon: float) -> PlausibleSettings:
-    """The settings of a definition, eps in metres.
+    """Return the settings of a definition, eps in metres.
 
     "paper": sums, no tolerance, 10 000 uniform rotations. "reference": as in the authors'
     simulated experiments, with c_max 1000, a longer x axis and the same rotations for all seeds.
@@ -158,6 +158,6 @@ def plausible_settings(definition: str, epsilon: float) -> PlausibleSettings:
 
 
 def definition_name(settings: PlausibleSettings) -> str | None:
-    """The name of the definition that has these settings, whatever its epsilon; None for none."""
+    """Return the name of the definition of these settings, whatever its epsilon; else None."""
     named = ((name, plausible_settings(name, settings.epsilon)) for name in DEFINITIONS)
     return next((name for name, by in named if by == settings), None)

@@ -1,4 +1,4 @@
-"""How far hypotheses are from the true pose, and from the plausible set."""
+"""Errors of hypotheses to the true pose, and distances to the plausible set."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from chsel.problem.surface import outline_distances_to
 def pose_errors(
     object_from_world: FloatArray, world_from_object: FloatArray, symmetry: ObjectSymmetry
 ) -> tuple[FloatArray, FloatArray]:
-    """Position errors (B,) in metres and rotation errors (B,) in radians, modulo symmetries.
+    """Return position errors (B,) in metres and rotation errors (B,) in radians, modulo symmetries.
 
     Of hypotheses object_from_world (B, 4, 4) to the true world_from_object (4, 4): the distance
     between the places of the object's centre, and the smallest angle of a rotation between the two
@@ -35,9 +35,9 @@ def pose_errors(
 
 
 def closest_pose(object_from_world: FloatArray, world_from_object: FloatArray, sdf: SdfGrid) -> int:
-    """Which hypothesis (B, 4, 4), B > 0, is closest to the true pose (4, 4), by its surface.
+    """Return the index of the hypothesis (B, 4, 4), B > 0, closest to the true pose (4, 4).
 
-    As `outline_distances_to` has it, so that poses that look the same are as close. Those that no
+    It is by `outline_distances_to`, so that poses that look the same are as close. Those that no
     kernel can read are left out; the first of equal ones.
     """
     poses, truth = Poses.of(object_from_world), Poses.of(inverse(world_from_object)[None])
@@ -55,7 +55,7 @@ def result_numbers(
     symmetry: ObjectSymmetry | None,
     trust: Trust | None = None,
 ) -> dict[str, float]:
-    """Counts, archive measures and trust, and the errors to the true pose (4, 4) where it is known.
+    """Return counts, archive measures, trust, and errors to the true pose (4, 4) if known.
 
     Errors are those of the best hypothesis and of the closest, see `closest_pose`, in metres and
     radians, as `pose_errors` defines them. symmetry: of the object; None if its mesh is not
@@ -81,7 +81,7 @@ def result_numbers(
 
 
 def cheapest(costs: FloatArray, quantile: float) -> BoolArray:
-    """Flags (B,) of hypotheses whose cost is at most this quantile of costs (B,); 1: all."""
+    """Return flags (B,) of hypotheses whose cost is at most this quantile of costs (B,); 1: all."""
     if not 0.0 < quantile <= 1.0:
         raise SettingError(f"quantile is {quantile}; accepted: above 0, at most 1")
     return np.asarray(costs <= np.quantile(costs, quantile, method="higher"))
@@ -89,7 +89,7 @@ def cheapest(costs: FloatArray, quantile: float) -> BoolArray:
 
 @dataclass(frozen=True)
 class PlausibleDiversity:
-    """How far hypotheses are from the plausible set (CHSEL, Sec. V), mm^2; 0 is best."""
+    """Distances of hypotheses from the plausible set (CHSEL, Sec. V), mm^2; 0 is best."""
 
     coverage: float  # mean over plausible poses of the distance to the nearest hypothesis
     plausibility: float  # mean over hypotheses of the distance to the nearest plausible pose
@@ -106,7 +106,7 @@ class PlausibleDiversity:
 
 
 def plausible_diversity(distances: FloatArray) -> PlausibleDiversity:
-    """The metrics of distances d (B, P) in mm^2, of hypotheses and plausible poses.
+    """Return the metrics of distances d (B, P) in mm^2, of hypotheses and plausible poses.
 
     Raises EvaluationError if there is none of either.
     """
@@ -122,7 +122,7 @@ def plausible_diversity(distances: FloatArray) -> PlausibleDiversity:
 def true_pose_rank(
     distance: SurfaceDistance, object_from_world: FloatArray, world_from_object: FloatArray
 ) -> float:
-    """Share in (0, 1] of the true pose (4, 4) and hypotheses (B, 4, 4) at least as far out as it.
+    """Return the share of true pose (4, 4) and hypotheses (B, 4, 4) at least as far out as it.
 
     Uniform over many registrations if these are calibrated, small if the set is too narrow, or off.
     Raises EvaluationError for fewer than 2 hypotheses.

@@ -59,7 +59,7 @@ _STREAM = 100  # of the plausible rotations' streams, and those after it
 
 
 def plausible_stream(seed: int, index: int = 0) -> np.random.Generator:
-    """A random stream of a plausible set, the same at every step of a session.
+    """Return a random stream of a plausible set, the same at every step of a session.
 
     index: 0 rotations of the grid, 1 members that are kept, from 2 on members around others, from
     200 on the search for modes.
@@ -81,7 +81,7 @@ class PoseGrid:
         return self.centre + self.offsets.points()
 
     def poses(self, index: IntArray) -> FloatArray:
-        """The poses (N, 4, 4), world_from_object, of these numbers (N,)."""
+        """Return the poses (N, 4, 4), world_from_object, of these numbers (N,)."""
         rotation, position = np.divmod(index, len(self.positions))
         return compose(self.rotations[rotation], self.positions[position])
 
@@ -90,7 +90,7 @@ class PoseGrid:
 
 
 def grid_around(truth: FloatArray, settings: PoseGridSettings, seed: int) -> PoseGrid:
-    """The grid of a definition around the true pose (4, 4), world_from_object.
+    """Return the grid of a definition around the true pose (4, 4), world_from_object.
 
     Its rotations are the same at every step of a session.
     """
@@ -110,7 +110,7 @@ def grid_around(truth: FloatArray, settings: PoseGridSettings, seed: int) -> Pos
 
 
 def scan_grid(cost: EvaluationCost, grid: PoseGrid, limit: float) -> tuple[IntArray, FloatArray]:
-    """Numbers and costs (G,) of all poses of a grid that cost less than a limit, ascending.
+    """Return numbers and costs (G,) of all poses of a grid that cost less than a limit, ascending.
 
     Raises EvaluationError if there are more than MOST_MEMBERS.
     """
@@ -164,14 +164,14 @@ def scan_grid(cost: EvaluationCost, grid: PoseGrid, limit: float) -> tuple[IntAr
 
 
 def _most_informative_first(known: FloatArray) -> IntArray:
-    """Known points, each far from those before it, then at random: to reject poses early."""
+    """Return known points, each far from those before it, then at random: to reject poses early."""
     first = farthest_points(known, _MOST_INFORMATIVE)
     rest = np.argsort(uniforms(plausible_stream(0), 0.0, 1.0, len(known)), kind="stable")
     return np.concatenate([first, rest[~np.isin(rest, first)]])
 
 
 def _bounds(sdf: SdfGrid, lookup: str) -> FloatArray:
-    """The least and the greatest distance (2, nodes) that the cell of each node reads, m."""
+    """Return the least and the greatest distance (2, nodes) that the cell of each node reads, m."""
     values = sdf.values
     if lookup == "nearest":
         return np.stack([values, values]).reshape(2, -1)
@@ -184,7 +184,7 @@ def _bounds(sdf: SdfGrid, lookup: str) -> FloatArray:
 
 
 def _beyond(sdf: SdfGrid, outside: str) -> tuple[float, float]:
-    """Weights of d^2 and s^2 in the least squared distance beyond the grid.
+    """Return weights of d^2 and s^2 in the least squared distance beyond the grid.
 
     d: to its box; s: what its nearest point reads. With gradients that point out of the box, the
     way to the surface is at least as long as both together; with others, it may be of any length.
@@ -196,9 +196,9 @@ def _beyond(sdf: SdfGrid, outside: str) -> tuple[float, float]:
 
 
 class Scan(NamedTuple):
-    """All that a scan reads: every rotation with every position."""
+    """Data of a scan of every rotation with every position."""
 
-    model: EvaluationModel
+    model: EvaluationModel  # of the evaluation cost
     bounds: FloatArray  # (2, nodes), see _bounds
     beyond: tuple[float, float]  # see _beyond
     rotations: FloatArray  # (R, 12), object_from_world, of poses at the origin
@@ -212,7 +212,7 @@ class Scan(NamedTuple):
 class ScanBuffer(NamedTuple):
     """EvaluationScratch of one thread, and the poses below the limit that it collects."""
 
-    cost_scratch: EvaluationScratch
+    cost_scratch: EvaluationScratch  # of the evaluation cost
     points: FloatArray  # (3, M) turned known points, m
     shifts: FloatArray  # (3, P + _LANES) translations of poses, m
     total: FloatArray  # (_LANES,) lower bounds of sums over known points, m
@@ -311,22 +311,22 @@ class TruePoseSettings(CheckedSettings):
     spacing: Annotated[float, positive] = 0.01  # metres between positions
     rotations: Annotated[int, positive, at_most(MOST_ROTATIONS)] = 2000  # beside the guess's
     angle: Annotated[float, positive] = 0.02  # standard deviation of these rotations, radians
-    passes: Annotated[int, positive, at_most(10)] = 2
-    cost: EvaluationCostSettings = field(default_factory=EvaluationCostSettings)
+    passes: Annotated[int, positive, at_most(10)] = 2  # in all
+    cost: EvaluationCostSettings = field(default_factory=EvaluationCostSettings)  # that is lowered
 
 
 class TruePose(NamedTuple):
     """The pose of least evaluation cost near a guess."""
 
     world_from_object: FloatArray  # (4, 4)
-    cost: float
-    guess_cost: float
+    cost: float  # of this pose
+    guess_cost: float  # of the guess
 
 
 def find_true_pose(
     problem: RegistrationProblem, guess: FloatArray, settings: TruePoseSettings | None = None
 ) -> TruePose:
-    """The pose of least evaluation cost near a guess, world_from_object (4, 4).
+    """Return the pose of least evaluation cost near a guess, world_from_object (4, 4).
 
     problem: that of the last step, when most is known. The least of all poses looked at, exactly.
     So the authors made T* of real data from a pose set by hand; plausible sets are around it.
@@ -352,7 +352,7 @@ def find_true_pose(
 def _best(
     cost: EvaluationCost, grid: PoseGrid, best: FloatArray, least: float
 ) -> tuple[FloatArray, float]:
-    """The cheapest pose of a grid and its cost; the best one before if none is cheaper."""
+    """Return the cheapest pose of a grid and its cost; the best one before if none is cheaper."""
     look = np.arange(0, len(grid), max(1, len(grid) // _FIRST_LOOK))
     look_costs = cost.evaluate(inverse(grid.poses(look)))
     index, costs = scan_grid(cost, grid, min(least, float(look_costs.min())))

@@ -1,4 +1,4 @@
-"""How far an object's surface in a plausible pose is from its surface in an estimated one.
+"""Distances of an object's surface in plausible poses from its surface in estimated ones.
 
     d(b, p) = 1/Q sum_q (1000 |s_mesh(X_b Y_p u_q)|)^2   in mm^2
 
@@ -38,7 +38,7 @@ _MOST_POINTS = 1_000_000
 
 @dataclass(frozen=True)
 class DistanceSettings(CheckedSettings):
-    """How distances are measured."""
+    """Settings of surface distances."""
 
     points: Annotated[int, positive, at_most(_MOST_POINTS)] = 500  # Q, 200 in the paper
     # "exact" measures to the mesh for every pair of poses; "nearest" only for the few pairs that
@@ -75,7 +75,7 @@ class SurfaceDistance:
             self._tree.init(self._vertices, self._faces)
 
     def between(self, object_from_world: FloatArray, world_from_object: FloatArray) -> FloatArray:
-        """d (B, P) in mm^2 of estimates (B, 4, 4) and plausible poses (P, 4, 4).
+        """Return d (B, P) in mm^2 of estimates (B, 4, 4) and plausible poses (P, 4, 4).
 
         With method "nearest", the least of every row and column are exact, others are the grid's.
         """
@@ -91,7 +91,7 @@ class SurfaceDistance:
         return distances
 
     def _by_grid(self, to_object: FloatArray, to_world: FloatArray) -> FloatArray:
-        """All distances (B, P) by the grid, of poses (B, 12) and (P, 12)."""
+        """Return distances (B, P) by the grid, of poses (B, 12) and (P, 12)."""
         total = np.empty((len(to_object), len(to_world)))
         run = partial(fill_mean_squares, self._field, self._points, to_object, to_world, total)
         parallel_for(run, len(total), lambda: places_for(self._points.shape[1]))
@@ -100,7 +100,7 @@ class SurfaceDistance:
     def _exact(
         self, to_object: FloatArray, to_world: FloatArray, rows: IntArray, columns: IntArray
     ) -> FloatArray:
-        """Distances (N,) to the mesh of pairs of poses (B, 4, 4) and (P, 4, 4)."""
+        """Return distances (N,) to the mesh of pairs of poses (B, 4, 4) and (P, 4, 4)."""
         total = np.zeros(len(rows))
         count = self._points.shape[1]
         size = max(1, _POINTS_AT_ONCE // count)
@@ -116,7 +116,7 @@ class SurfaceDistance:
 
 
 def surface_points(mesh: trimesh.Trimesh, count: int, key: StreamKey) -> FloatArray:
-    """Points (count, 3) spread over the surface of a mesh at random, uniformly by area."""
+    """Return points (count, 3) spread over the surface of a mesh at random, uniformly by area."""
     corners = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)]
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     areas = np.sqrt((np.cross(b - a, c - a) ** 2).sum(axis=1))
@@ -130,7 +130,7 @@ def surface_points(mesh: trimesh.Trimesh, count: int, key: StreamKey) -> FloatAr
 
 
 def _finite(transforms: FloatArray) -> FloatArray:
-    """Transforms (B, 4, 4) as numbers; PoseError for another shape, or one that is not finite."""
+    """Return transforms (B, 4, 4) as numbers; PoseError for another shape, or not finite ones."""
     transforms = stacked(transforms)
     finite = np.isfinite(transforms[:, :3]).all(axis=(1, 2))
     if not finite.all():
@@ -139,7 +139,7 @@ def _finite(transforms: FloatArray) -> FloatArray:
 
 
 def _nearest(distances: FloatArray) -> tuple[IntArray, IntArray]:
-    """Rows and columns (N,) of the few least entries of every row and of every column."""
+    """Return rows and columns (N,) of the few least entries of every row and of every column."""
     near = np.zeros(distances.shape, dtype=bool)
     for axis in range(2):
         count = min(_CANDIDATES, distances.shape[axis])

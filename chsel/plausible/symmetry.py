@@ -56,10 +56,10 @@ class ObjectSymmetry:
     centre: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,), m
     rotations: FloatArray = field(default_factory=lambda: np.eye(3)[None])  # (S, 3, 3)
     axis: FloatArray | None = None  # (3,), unit, of revolution
-    sphere: bool = False
+    sphere: bool = False  # whether all rotations are symmetries
 
     def rotation_errors(self, relative: FloatArray) -> FloatArray:
-        """The smallest angles (B,), radians, of rotations (B, 3, 3) times a symmetry.
+        """Return the smallest angles (B,), radians, of rotations (B, 3, 3) times a symmetry.
 
         relative: object_from_world of an estimate times world_from_object of the truth. Over all
         rotations about an axis u, the smallest angle of R times one is the angle from u to R u.
@@ -75,7 +75,7 @@ class ObjectSymmetry:
 
 
 def object_symmetry(mesh: trimesh.Trimesh) -> ObjectSymmetry:
-    """The symmetries of a mesh, within the tolerance of `RotatedSurface`.
+    """Return the symmetries of a mesh, within the tolerance of `RotatedSurface`.
 
     The centre is the surface's centroid, which every symmetry maps to itself, and which open meshes
     have, too. A pure function of vertices and faces; results are kept.
@@ -85,20 +85,20 @@ def object_symmetry(mesh: trimesh.Trimesh) -> ObjectSymmetry:
         surface = RotatedSurface(mesh)
         axes = _axes_of_revolution(surface) if surface.radius > 0.0 else np.zeros((0, 3))
         if len(axes) > 1:
-            found = ObjectSymmetry(surface.centre, sphere=True)
+            symmetry = ObjectSymmetry(surface.centre, sphere=True)
         elif len(axes) == 1:
             half_turn = _half_turn_across(surface, axes[0])
-            found = ObjectSymmetry(surface.centre, half_turn, axes[0])
+            symmetry = ObjectSymmetry(surface.centre, half_turn, axes[0])
         elif surface.radius > 0.0:
-            found = ObjectSymmetry(surface.centre, _finite_group(surface))
+            symmetry = ObjectSymmetry(surface.centre, _finite_group(surface))
         else:
-            found = ObjectSymmetry(surface.centre)
-        _FOUND[key] = found
+            symmetry = ObjectSymmetry(surface.centre)
+        _FOUND[key] = symmetry
     return _FOUND[key]
 
 
 def grid_symmetry(sdf: SdfGrid) -> ObjectSymmetry:
-    """The identity alone, about the centre of an object whose mesh is not available."""
+    """Return the identity alone, about the centre of an object whose mesh is not available."""
     return ObjectSymmetry(object_centre(sdf) if has_surface(sdf) else sdf.bounds.mean(axis=0))
 
 
@@ -118,7 +118,7 @@ class RotatedSurface:
     areas: FloatArray  # (F,), shares of the total
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
-        """Only centre and radius are set for a mesh without an area."""
+        """Set centre and radius alone for a mesh without an area."""
         import igl
         import trimesh
 
@@ -142,14 +142,14 @@ class RotatedSurface:
         self._tree.init(self._vertices, self._faces)
 
     def errors(self, turns: FloatArray, count: int = _TESTED) -> FloatArray:
-        """Root mean square distances (T,) under rotations (T, 3, 3), in units of the tolerance."""
+        """Return RMS distances (T,) under rotations (T, 3, 3), in units of the tolerance."""
         _, squared, _, _ = self._closest(turns, count)
         return np.sqrt(squared.mean(axis=1)) / (2.0 * _TOLERANCE)
 
     def aligned(self, turns: FloatArray, *, steps: int, count: int) -> FloatArray:
-        """Rotations (T, 3, 3) moved to the nearest one by which the surface matches itself best.
+        """Return rotations (T, 3, 3) moved to the nearest one that matches the surface best.
 
-        By Gauss-Newton steps on the distances of rotated points from the surface.
+        It takes Gauss-Newton steps on the distances of rotated points from the surface.
         """
         for _ in range(steps):
             moved, squared, face, closest = self._closest(turns, count)
@@ -169,7 +169,7 @@ class RotatedSurface:
         return turns
 
     def coarse_errors(self, turns: FloatArray, count: int = 128) -> FloatArray:
-        """Mean distances (T,) of rotated points from the surface, of the diameter, by a grid."""
+        """Return mean distances (T,) of rotated points from the surface by a grid, in diameters."""
         empty = np.ones((_CELLS, _CELLS, _CELLS), dtype=bool)
         empty[_cells(self._points)] = False
         distance = distance_transform_edt(empty) / _CELLS
@@ -183,7 +183,7 @@ class RotatedSurface:
     def _closest(
         self, turns: FloatArray, count: int
     ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
-        """Rotated points (T, count, 3), their squared distances, nearest faces and points there."""
+        """Return rotated points (T, count, 3), squared distances, and nearest faces and points."""
         moved = np.einsum("tij,nj->tni", turns, self._points[:count])
         squared, face, closest = self._tree.squared_distance(
             self._vertices, self._faces, moved.reshape(-1, 3)
@@ -193,13 +193,13 @@ class RotatedSurface:
 
 
 def _cells(points: FloatArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Indices of the cells in which points (..., 3) of the unit ball are."""
+    """Return indices of the cells in which points (..., 3) of the unit ball are."""
     index = np.clip(((points + 1.0) * (_CELLS / 2)).astype(np.int64), 0, _CELLS - 1)
     return index[..., 0], index[..., 1], index[..., 2]
 
 
 def _axes_of_revolution(surface: RotatedSurface) -> FloatArray:
-    """Unit axes (A, 3) about which every rotation matches: none, one, or two of a sphere's.
+    """Return unit axes (A, 3) about which every rotation matches: none, one, or two of a sphere's.
 
     Candidates are the axes of inertia, which bear noise of normals, and those of slippage, which
     bear equal moments: rotations about u move points p within the surface where n . (u x p) = 0
@@ -218,21 +218,21 @@ def _axes_of_revolution(surface: RotatedSurface) -> FloatArray:
 
 
 def _largest_error_about(surface: RotatedSurface, axis: FloatArray) -> float:
-    """Of rotations about an axis; few points are enough to see a large one."""
+    """Return the largest error of rotations about an axis; few points are enough to see it."""
     turns = axis_angle(np.tile(axis, (len(_ANGLES), 1)), _ANGLES)
     error = surface.errors(turns, count=100).max()
     return float(error if error > 2.0 else surface.errors(turns).max())
 
 
 def _half_turn_across(surface: RotatedSurface, axis: FloatArray) -> FloatArray:
-    """The identity, and a half turn that swaps the ends of an axis if it matches (1 or 2, 3, 3)."""
+    """Return the identity, and a half turn that swaps the axis's ends if it matches."""
     across = np.linalg.svd(axis[None])[2][1]  # unit, at a right angle to the axis
     turns = np.array([np.eye(3), 2.0 * np.outer(across, across) - np.eye(3)])
     return turns[surface.errors(turns) <= 1.0]
 
 
 def _finite_group(surface: RotatedSurface) -> FloatArray:
-    """The symmetries (S, 3, 3) of a surface without an axis of revolution, the identity first.
+    """Return the symmetries (S, 3, 3) of a surface that is none of revolution, identity first.
 
     Rotations that match better than their neighbours on a coarse grid are aligned with the surface.
     Each, the best first, joins the group if all products match.
@@ -255,20 +255,20 @@ def _finite_group(surface: RotatedSurface) -> FloatArray:
 
 
 def _best_first(turns: FloatArray, errors: FloatArray, most: float) -> FloatArray:
-    """Rotations (T, 3, 3) with errors (T,) of at most so much, in the order of the errors."""
+    """Return rotations (T, 3, 3) with errors (T,) of at most so much, the best first."""
     order = np.argsort(errors, kind="stable")
     return turns[order[errors[order] <= most]]
 
 
 @cache
 def _spread() -> tuple[FloatArray, IntArray]:
-    """Rotations (N, 3, 3) spread evenly, and the indices (N, K) of each and its neighbours.
+    """Return rotations (N, 3, 3) spread evenly, and the indices (N, K) of each and its neighbours.
 
     Alexa, 2022, "Super-Fibonacci spirals: fast, low-discrepancy sampling of SO(3)".
     """
-    place = np.arange(_SPREAD) + 0.5
-    inner, outer = np.sqrt(place / _SPREAD), np.sqrt(1.0 - place / _SPREAD)
-    first, second = 2.0 * np.pi * place / np.sqrt(2.0), 2.0 * np.pi * place / 1.533751168755204288
+    at = np.arange(_SPREAD) + 0.5
+    inner, outer = np.sqrt(at / _SPREAD), np.sqrt(1.0 - at / _SPREAD)
+    first, second = 2.0 * np.pi * at / np.sqrt(2.0), 2.0 * np.pi * at / 1.533751168755204288
     pairs = [(inner, np.sin(first)), (inner, np.cos(first))]
     pairs += [(outer, np.sin(second)), (outer, np.cos(second))]
     quaternion = np.array([radius * share for radius, share in pairs]).T
@@ -277,13 +277,13 @@ def _spread() -> tuple[FloatArray, IntArray]:
 
 
 def _angles_between(turns: FloatArray, others: FloatArray) -> FloatArray:
-    """Angles (T, O), radians, between rotations (T, 3, 3) and (O, 3, 3)."""
+    """Return angles (T, O), radians, between rotations (T, 3, 3) and (O, 3, 3)."""
     trace = turns.reshape(-1, 9) @ others.reshape(-1, 9).T
     return np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))
 
 
 def _distinct(turns: FloatArray, most: int) -> FloatArray:
-    """Rotations (T, 3, 3) without those near an earlier one, at most so many."""
+    """Return rotations (T, 3, 3) without those near an earlier one, at most so many."""
     kept: list[FloatArray] = []
     while len(turns) and len(kept) < most:
         kept.append(turns[0])
@@ -292,7 +292,7 @@ def _distinct(turns: FloatArray, most: int) -> FloatArray:
 
 
 def generated(turns: FloatArray) -> FloatArray | None:
-    """The group (S, 3, 3) of all products of approximate rotations (T, 3, 3), the identity first.
+    """Return the group (S, 3, 3) of products of approximate rotations (T, 3, 3), identity first.
 
     None if it has more than 60 elements, or is not a group. Every element is replaced by the mean
     of what the table of products says it is, which converges to an exact group (Grove, Karcher and

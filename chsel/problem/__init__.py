@@ -1,1 +1,1 @@
-"""What a registration is: points, object, poses, settings, the problem and its result."""
+"""A registration: points, object, poses, settings, the problem and its result."""

@@ -25,7 +25,7 @@ _MOST_BODIES = 1000  # that are compared, the largest ones
 
 
 def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
-    """The checked mesh in a file of any format that trimesh reads; scenes become one mesh.
+    """Return the checked mesh in a file of any format that trimesh reads; scenes become one mesh.
 
     scale: metres per unit of the file; where the file states its unit (COLLADA, 3MF), of that unit
     in metres, with a warning if it is another one. Checks and raises as `clean_mesh`, and MeshError
@@ -74,7 +74,7 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
 
 
 def _metres_of(unit: str | None, name: str) -> float:
-    """Metres of the unit that a file states; 1 if it states none."""
+    """Return metres of the unit that a file states; 1 if it states none."""
     import trimesh
 
     if unit is None:
@@ -108,7 +108,7 @@ def clean_mesh(
     metres: float = 1.0,
     hint: str = "multiply its vertices by 0.001",
 ) -> trimesh.Trimesh:
-    """A checked mesh in metres: equal vertices merged, faces turned outward, float64.
+    """Return a checked mesh in metres: equal vertices merged, faces turned outward, float64.
 
     vertices (V, 3): in units of `scale` times `metres`. faces (F, 3): indices of vertices. hint:
     what to do about millimetres. Overlapping parts are united, see `outer_surface`. Warns about
@@ -154,12 +154,12 @@ def clean_mesh(
 
 
 def mesh_digest(mesh: trimesh.Trimesh) -> str:
-    """Digest of a mesh: of its vertices as float64 and its faces as int64."""
+    """Return digest of a mesh: of its vertices as float64 and its faces as int64."""
     return digest(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
 
 
 def check_bodies(mesh: trimesh.Trimesh, name: str) -> list[MeshWarning]:
-    """A warning if bodies of a mesh (metres) are too far apart for a single object.
+    """Return a warning if bodies of a mesh (metres) are too far apart for a single object.
 
     The distance between two bodies is that of the boxes around them; near bodies count as one.
     """
@@ -187,7 +187,7 @@ def check_bodies(mesh: trimesh.Trimesh, name: str) -> list[MeshWarning]:
 
 
 def check_frame(mesh: trimesh.Trimesh, name: str) -> list[MeshWarning]:
-    """A warning if a mesh (metres) lies far from the origin of its frame."""
+    """Return a warning if a mesh (metres) lies far from the origin of its frame."""
     away = float(np.sqrt((mesh.bounds.mean(axis=0) ** 2).sum()))
     diameter = float(np.sqrt((mesh.extents**2).sum()))
     if away <= _FAR * diameter:

@@ -157,14 +157,14 @@ class _Parts:
             self._volume[part] *= -1.0
 
     def _place(self, part: int) -> str:
-        """Where a part is, and its size."""
+        """Return a text of a part's position and size."""
         centre = 0.5 * (self._lower[part] + self._upper[part])
         at = ", ".join(f"{c:.3g}" for c in centre + 0.0)
         size = " x ".join(f"{side:.3g}" for side in self._upper[part] - self._lower[part])
         return f"the one of {size} m around ({at}) m"
 
     def _part_mesh(self, parts: list[int]) -> trimesh.Trimesh:
-        """Parts as a mesh."""
+        """Return parts as a mesh."""
         import trimesh
 
         rows = np.concatenate([self._rows[part] for part in parts])
@@ -173,7 +173,7 @@ class _Parts:
         return mesh
 
     def _contains(self, outer: Any, inner: Any) -> bool:
-        """Whether a closed part is strictly inside of another one."""
+        """Return whether a closed part is strictly inside of another one."""
         if not (
             (self._lower[outer] < self._lower[inner] - _TOUCHING).all()
             and (self._upper[outer] > self._upper[inner] + _TOUCHING).all()
@@ -191,14 +191,14 @@ class _Parts:
         )
 
     def _outward(self, part: Any) -> trimesh.Trimesh:
-        """A closed part as a mesh that looks outward."""
+        """Return a closed part as a mesh that looks outward."""
         mesh = self._part_mesh([part])
         if self._volume[part] < 0.0:
             mesh.invert()
         return mesh
 
     def _groups(self) -> list[list[int]]:
-        """Parts whose boxes overlap or touch."""
+        """Return parts whose boxes overlap or touch."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
@@ -217,14 +217,14 @@ class _Parts:
 
 
 def _repeats(edges: Any) -> IntArray:
-    """How often each row (E,) of edges (E, 2) is there."""
+    """Return the number of times that each row (E,) of edges (E, 2) is there."""
     _, row, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
     repeats: IntArray = count[row.reshape(-1)]
     return repeats
 
 
 def _winding_distance(mesh: trimesh.Trimesh, points: Any) -> FloatArray:
-    """Distance (N,) of points (N, 3) to a closed mesh that looks outward, negative inside."""
+    """Return distances (N,) of points (N, 3) to a closed, outward mesh, negative inside."""
     import igl
 
     signed: FloatArray = igl.signed_distance(
@@ -237,7 +237,7 @@ def _winding_distance(mesh: trimesh.Trimesh, points: Any) -> FloatArray:
 
 
 def _union(solids: list[trimesh.Trimesh]) -> trimesh.Trimesh | None:
-    """The union of closed meshes that look outward; None if one is no manifold.
+    """Return the union of closed meshes that look outward; None if one is no manifold.
 
     They are a micrometre larger meanwhile, as the faces of parts that touch are rounded apart.
     """
@@ -265,7 +265,7 @@ def _union(solids: list[trimesh.Trimesh]) -> trimesh.Trimesh | None:
 
 
 def _offset(mesh: trimesh.Trimesh, distance: float) -> FloatArray:
-    """Vertices (V, 3), moved so that faces move by `distance` along their normals, metres."""
+    """Return vertices (V, 3), moved so that faces move by `distance` along normals, metres."""
     angles, corners = np.asarray(mesh.face_angles), np.asarray(mesh.faces)
     normals = np.zeros((len(mesh.vertices), 3))
     np.add.at(normals, corners, angles[..., None] * np.asarray(mesh.face_normals)[:, None])
@@ -279,7 +279,7 @@ def _offset(mesh: trimesh.Trimesh, distance: float) -> FloatArray:
 
 
 def _without_hidden(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh without faces that are inside of others, by the winding number in front of them.
+    """Return the mesh without faces inside of others, by the winding number in front of them.
 
     A face that is only partly inside stays.
     """
@@ -295,7 +295,7 @@ def _without_hidden(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _without_walls(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh with each face once, and without faces that two bodies have in common."""
+    """Return the mesh with each face once, and without faces that two bodies have in common."""
     import trimesh
 
     key = np.sort(mesh.faces, axis=1)
@@ -319,7 +319,7 @@ def _without_walls(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _split_edges(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh, cut at edges of more than two faces so that each has at most two."""
+    """Return the mesh, cut at edges of more than two faces so that each has at most two."""
     import trimesh
     from scipy.cluster.hierarchy import DisjointSet
     from scipy.sparse import coo_array
@@ -352,7 +352,7 @@ def _split_edges(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def _pairs_of(
     mesh: trimesh.Trimesh, rows: IntArray, labels: IntArray, sheets: Any
 ) -> list[tuple[int, int]]:
-    """Pairs of the faces around an edge, which belong to the same part.
+    """Return pairs of the faces around an edge, which belong to the same part.
 
     rows: of the edge in `mesh.edges`. Paired are faces that run through it in opposite ways, first
     those that other edges connect, then those with the least material between them.

@@ -1,4 +1,4 @@
-"""What points are off: a model of their errors, and the energy of poses by it.
+"""A model of the errors of points, and the energy of poses by it.
 
     E(X) = -log sum_k w_k prod_i [(1 - e) N(r_i; 0, s_k) + e / D]^t
            + t F(sum_j min(d_j^2 / 2 f^2, c))
@@ -41,14 +41,14 @@ _ROUNDS = 20
 
 
 class Noise(NamedTuple):
-    """What known points are off, where the object is."""
+    """The estimated noise of known points."""
 
     sigma: float  # standard deviation of those that are on the object, metres
     outliers: float  # share of those that are not
 
 
 def estimate_noise(distances: FloatArray, sensor_noise: float) -> Noise:
-    """Noise and share of outliers from distances (N,), in metres, at the pose that fits best.
+    """Return noise and share of outliers by distances (N,), in metres, at the best pose.
 
     Both at once: an outlier is a distance beyond FOREIGN sigma, and sigma is that of all others.
     The sensor's noise, metres, counts as that of PRIOR_CONTACTS further contacts (the mean of a
@@ -73,7 +73,7 @@ def estimate_noise(distances: FloatArray, sensor_noise: float) -> Noise:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """How inexact points are."""
+    """A model of the errors of points."""
 
     sigmas: tuple[float, ...]  # s_k, metres, ascending
     weights: tuple[float, ...]  # w_k, whose sum is 1
@@ -82,7 +82,7 @@ class NoiseModel:
     shared: float = 0.0  # metres, of residuals and of depths, that cost nothing
 
     def costs(self, residuals: FloatArray) -> FloatArray:
-        """-log of the density (..., K) of residuals (...), metres; 0 at best, at 0 and s_1."""
+        """Return -log of the density (..., K) of residuals (...), metres; 0 at 0 and s_1."""
         sigmas = np.array(self.sigmas)
         peak = (1.0 - SHARE) / (math.sqrt(2.0 * math.pi) * sigmas)
         sizes = np.maximum(np.abs(residuals) - self.shared, 0.0)[..., None]
@@ -90,7 +90,7 @@ class NoiseModel:
         return logs((peak[0] + SHARE / EXTENT) / density)
 
     def energies(self, residuals: FloatArray, depths: FloatArray) -> FloatArray:
-        """E (B,) of poses by residuals (B, N) and depths (B, M), metres."""
+        """Return E (B,) of poses by residuals (B, N) and depths (B, M), metres."""
         costs, power = self.costs(residuals).sum(axis=1), self.power(residuals.shape[1])
         levels = power * costs - logs(np.array(self.weights))  # (B, K)
         least = levels.min(axis=1)
@@ -100,12 +100,12 @@ class NoiseModel:
         return known + power * np.minimum(wrong, self.wrong + LATER * (wrong - self.wrong))
 
     def power(self, known: int) -> float:
-        """t, for so many known points."""
+        """Return t, for so many known points."""
         return min(1.0, INDEPENDENT / max(known, 1))
 
 
 def noise_model(sensor_noise: float, shared: float = 0.0) -> NoiseModel:
-    """What is known of a sensor whose contacts are off by so much, standard deviation in metres."""
+    """Return the model of a sensor of that standard deviation, metres."""
     ratio = (_MOST_ERROR / _LEAST_ERROR) ** (1.0 / (LEVELS - 1))
     errors = [_LEAST_ERROR * ratio**k for k in range(LEVELS)]
     prior = [math.exp(-0.5 * (math.log(m / _USUAL_ERROR) / _WIDTH) ** 2) for m in errors]

@@ -25,7 +25,7 @@ from chsel.numerics.arrays import (
     frozen,
     read_only,
 )
-from chsel.numerics.cell_set import bounds_of, set_voxels
+from chsel.numerics.cell_set import bounds_of, set_voxels, voxels_of
 from chsel.problem.sdf_grid import SdfGrid
 
 FREE_RESOLUTION = 0.01  # side of a voxel of free space, metres
@@ -44,7 +44,8 @@ MOST_AWAY = 100.0  # from the world's origin, or the workspace, to what a robot 
 
 _LEAST_AWAY = 50.0  # the same for small objects, metres
 
-_CLASSES = ("free", "occupied", "known", "known_sdf")
+POINT_CLASSES = ("free", "occupied", "known")
+_ARRAYS = (*POINT_CLASSES, "known_sdf")
 _BLOCK = np.array(list(np.ndindex(3, 3, 3))) - 1  # a voxel, at index 13, and its 26 neighbours
 _MOST_VOXELS = 2.0**62  # that can be numbered
 
@@ -72,7 +73,7 @@ class KnownPoints(ShapesShown):
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
-        for name in ("free", "occupied", "known"):
+        for name in POINT_CLASSES:
             object.__setattr__(self, name, frozen(name, getattr(self, name), (None, 3)))
         sdf = np.zeros(len(self.known)) if self.known_sdf is None else self.known_sdf
         object.__setattr__(self, "known_sdf", frozen("known_sdf", sdf, (None,)))
@@ -91,7 +92,7 @@ class KnownPoints(ShapesShown):
     @property
     def count(self) -> int:
         """Number of points in all classes."""
-        return len(self.free) + len(self.occupied) + len(self.known)
+        return sum(len(getattr(self, name)) for name in POINT_CLASSES)
 
     @property
     def contacts(self) -> FloatArray:
@@ -101,23 +102,23 @@ class KnownPoints(ShapesShown):
     @cached_property
     def digest(self) -> str:
         """Digest of all points, in their order."""
-        return digest(*(getattr(self, name) for name in _CLASSES))
+        return digest(*(getattr(self, name) for name in _ARRAYS))
 
     def merged(self, new: KnownPoints) -> KnownPoints:
-        """These points followed by new ones, class by class."""
+        """Return these points followed by new ones, class by class."""
         return KnownPoints.joined([self, new])
 
     @classmethod
     def joined(cls, parts: Sequence[KnownPoints]) -> KnownPoints:
-        """The points of several parts, at least one, in their order, class by class."""
+        """Return the points of several parts, at least one, in their order, class by class."""
         arrays: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in parts]) for name in _CLASSES
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS
         }
         return cls(**arrays)
 
     def all_points(self) -> FloatArray:
-        """Every point of every class (N + K + M, 3)."""
-        return np.concatenate([self.free, self.occupied, self.known])
+        """Return every point of every class (N + K + M, 3)."""
+        return np.concatenate([getattr(self, name) for name in POINT_CLASSES])
 
 
 @dataclass(frozen=True)
@@ -146,13 +147,13 @@ class Workspace:
 
     @classmethod
     def around(cls, points: FloatArray, margin: float) -> Workspace:
-        """The bounds of points (N, 3), N > 0, padded by `margin` on every side."""
+        """Return the bounds of points (N, 3), N > 0, padded by `margin` on every side."""
         lower, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
         return cls(tuple(lower.tolist()), tuple(upper.tolist()))
 
 
 def world_points(name: str, given: Any) -> FloatArray:
-    """Points (N, 3) as a program or a file gives them, metres; none for None.
+    """Return points (N, 3) as a program or a file gives them, metres; none for None.
 
     Raises PointsError unless it is such an array, and for places beyond FARTHEST_PLACE.
     """
@@ -163,7 +164,7 @@ def world_points(name: str, given: Any) -> FloatArray:
 def world_known_points(
     *, free: Any = None, occupied: Any = None, known: Any = None, known_sdf: Any = None
 ) -> KnownPoints:
-    """The same of all classes; a known point needs its signed distance."""
+    """Return points of all classes, as `world_points` does; a known point needs its distance."""
     sdf = np.zeros(0) if known_sdf is None else known_sdf
     return KnownPoints(
         free=world_points("free", free),
@@ -174,14 +175,14 @@ def world_known_points(
 
 
 def workspace_around(points: KnownPoints, sdf: SdfGrid) -> Workspace:
-    """Where an object can be that touches some of the points: their bounds and its diameter."""
+    """Return the workspace of an object that touches points: their bounds and its diameter."""
     return Workspace.around(points.all_points(), sdf.diameter)
 
 
 def check_places(
     name: str, places: FloatArray, diameter: float, workspace: Workspace | None = None
 ) -> list[PointsWarning]:
-    """A warning if places (N, 3) are so far away that they may be in millimetres.
+    """Return a warning if places (N, 3) are so far away that they may be in millimetres.
 
     That is, all far from the world's origin and from the workspace, where there is one. diameter:
     of the object, metres.
@@ -200,7 +201,7 @@ def check_places(
 
 
 def check_workspace(workspace: Workspace, diameter: float) -> list[PointsWarning]:
-    """A warning if a workspace is so wide that it may be in millimetres; diameter: metres.
+    """Return a warning if a workspace is so wide that it may be in millimetres; diameter: metres.
 
     Raises PointsError for corners beyond FARTHEST_PLACE.
     """
@@ -213,14 +214,14 @@ def check_workspace(workspace: Workspace, diameter: float) -> list[PointsWarning
 
 
 def same_place(diameter: float) -> float:
-    """Up to which distance (metres) points on an object measure the same place."""
+    """Return up to which distance (metres) points on an object measure the same place."""
     return min(SAME_PLACE, MOST_SAME * diameter)
 
 
 def distinct_points(
     new: KnownPoints, earlier: KnownPoints, apart: float
 ) -> tuple[KnownPoints, list[PointsWarning]]:
-    """New points without those at a place that was measured before, and a warning about them.
+    """Return new points at places that were not measured before, and a warning about others.
 
     Such points have one error in common, so they count once: occupied and known points farther than
     `apart` metres from all earlier ones are kept, by position and signed distance. Free points are
@@ -249,7 +250,7 @@ def distinct_points(
 
 
 def away_from(points: FloatArray, earlier: FloatArray, apart: float) -> BoolArray:
-    """Which points (N, k) are farther than `apart` from all earlier ones (M, k)."""
+    """Return flags (N,) of points (N, k) farther than `apart` from all earlier ones (M, k)."""
     if len(points) == 0 or len(earlier) == 0:
         return np.ones(len(points), dtype=bool)
     if len(points) * len(earlier) <= _FEW**2:
@@ -261,7 +262,7 @@ def away_from(points: FloatArray, earlier: FloatArray, apart: float) -> BoolArra
 
 
 def first_at_place(points: FloatArray, earlier: FloatArray, apart: float) -> BoolArray:
-    """Which points (N, k) are farther than `apart` from all earlier ones (M, k) and kept ones."""
+    """Return flags (N,) of points (N, k) farther than `apart` from earlier (M, k) and kept ones."""
     first = away_from(points, earlier, apart)
     left = np.flatnonzero(first)
     left = left[np.sort(np.unique(points[left], axis=0, return_index=True)[1])]
@@ -276,7 +277,7 @@ def first_at_place(points: FloatArray, earlier: FloatArray, apart: float) -> Boo
 
 
 def _near(points: FloatArray, apart: float) -> Callable[[int], Any]:
-    """A function of n that returns which of points (N, k) are up to `apart` from the n-th one."""
+    """Return a function of n: which of points (N, k) are up to `apart` from the n-th one."""
     if len(points) <= _FEW:
         away = points[:, None] - points
         within = (away**2).sum(axis=2) <= apart**2
@@ -298,16 +299,16 @@ class Lattice:
         require_positive("voxel spacing", self.spacing)
 
     def voxels(self, points: FloatArray) -> np.ndarray:
-        """Index (N, 3) of the voxel that holds each point: the nearest centre, ties to even."""
-        return np.rint((points - np.array(self.origin)) / self.spacing).astype(np.int64)
+        """Return indices (N, 3) of the voxels of points (N, 3): nearest centres, ties to even."""
+        return voxels_of(points, np.array(self.origin), self.spacing)
 
     def centres(self, voxels: np.ndarray) -> FloatArray:
-        """Centres (N, 3) of voxels (N, 3)."""
+        """Return centres (N, 3) of voxels (N, 3)."""
         return np.array(self.origin) + voxels * self.spacing
 
 
 def voxels_spanned(points: FloatArray, resolution: float) -> float:
-    """At least the number of voxels in a grid around points (N, 3), N > 0; see VoxelGrid."""
+    """Return at least the number of voxels in a grid around points (N, 3), N > 0; see VoxelGrid."""
     return math.prod((np.ptp(points, axis=0) / resolution + 3.0).tolist())
 
 
@@ -321,7 +322,7 @@ class VoxelGrid:
 
     @classmethod
     def around(cls, free: FloatArray, resolution: float, most: int = 100_000_000) -> VoxelGrid:
-        """The voxels of free points (N, 3), N > 0. Raises SettingError for too many voxels."""
+        """Return the voxels of free points (N, 3), N > 0. Raises SettingError for too many."""
         bounds = bounds_of(free)
         count = voxels_spanned(bounds, resolution)
         if not count <= most:
@@ -354,7 +355,7 @@ class FreeVoxels:
         self._seen.clear()
 
     def holds(self, points: FloatArray) -> BoolArray:
-        """Which points (N, 3) are in a voxel added so far."""
+        """Return flags (N,) of points (N, 3) in a voxel added so far."""
         voxels = map(tuple, self.lattice.voxels(points).tolist())
         return np.array([voxel in self._seen for voxel in voxels], dtype=bool)
 
@@ -382,7 +383,7 @@ def check_points(
     free_resolution: float,
     workspace: Workspace | None = None,
 ) -> list[PointsWarning]:
-    """Warnings about suspicious points; none for points as a session yields them.
+    """Return warnings about suspicious points; none for points as a session yields them.
 
     diameter: of the object, metres. free_resolution: side of a free voxel, metres. workspace: where
     the object can be, if it was given and not derived from the points.
@@ -449,7 +450,7 @@ def check_points(
 
 
 def check_contacts(points: KnownPoints) -> list[PointsWarning]:
-    """A warning if the points only show where the object is not."""
+    """Return a warning if the points only show where the object is not."""
     if points.count == 0 or len(points.known) or len(points.occupied):
         return []
     text = (
@@ -460,7 +461,7 @@ def check_contacts(points: KnownPoints) -> list[PointsWarning]:
 
 
 def _enclosed(contacts: FloatArray, free: FloatArray, resolution: float) -> BoolArray:
-    """Which contacts (C, 3) are free points, or lie in a free voxel whose 26 neighbours are free.
+    """Return flags (C,) of contacts at a free point, or in a free voxel with 26 free neighbours.
 
     A contact in a free voxel is common, as the voxel's centre may be outside of the object; between
     free neighbours there is no room for an object thicker than a voxel.
@@ -483,12 +484,12 @@ def _enclosed(contacts: FloatArray, free: FloatArray, resolution: float) -> Bool
 
 
 def _diagonal(points: FloatArray) -> float:
-    """Diagonal in metres of the box around points (N, 3); 0 for none."""
+    """Return diagonal in metres of the box around points (N, 3); 0 for none."""
     return float(np.sqrt((np.ptp(points, axis=0) ** 2).sum())) if len(points) else 0.0
 
 
 def _spread(points: FloatArray) -> float:
-    """Twice the 90th percentile (m) of the distances of points (N, 3) from their median."""
+    """Return twice the 90th percentile (m) of the distances of points (N, 3) from their median."""
     away = points - np.median(points, axis=0)
     distance = np.sqrt((away**2).sum(axis=1))
     return 2.0 * float(np.percentile(distance, 90.0, method="lower"))

@@ -31,21 +31,21 @@ class Poses:
 
     @classmethod
     def of(cls, object_from_world: Any) -> Poses:
-        """The poses of transforms (B, 4, 4), finite or not. Raises PoseError for another shape."""
+        """Return the poses of transforms (B, 4, 4), finite or not; PoseError for another shape."""
         transforms = stacked(object_from_world)
         rotations = transforms[:, :3, :3].reshape(-1, 9)
         return cls(np.concatenate([rotations, transforms[:, :3, 3]], axis=1))
 
     @classmethod
     def joined(cls, parts: Sequence[Poses]) -> Poses:
-        """The poses of several parts, at least one, in their order."""
+        """Return the poses of several parts, at least one, in their order."""
         return cls(np.concatenate([part.numbers for part in parts]))
 
     def __len__(self) -> int:
         return len(self.numbers)
 
     def __getitem__(self, chosen: Any) -> Poses:
-        """The chosen poses: a slice, flags (B,) or indices (C,)."""
+        """Return the chosen poses: a slice, flags (B,) or indices (C,)."""
         return Poses(self.numbers[chosen])
 
     @property
@@ -70,7 +70,7 @@ class Poses:
 
     @property
     def origins(self) -> FloatArray:
-        """Where the object's origin is in the world (B, 3), metres: -R^T t."""
+        """The object's origins in the world (B, 3), metres: -R^T t."""
         return -rotated(np.swapaxes(self.rotations, 1, 2), self.translations)
 
     @cached_property
@@ -80,7 +80,7 @@ class Poses:
 
 
 def stacked(object_from_world: Any) -> FloatArray:
-    """Transforms (B, 4, 4) as an array, finite or not. Raises PoseError for another shape."""
+    """Return transforms (B, 4, 4) as an array, finite or not; PoseError for another shape."""
     transforms = np.asarray(object_from_world, dtype=np.float64)
     if transforms.ndim != 3 or transforms.shape[1:] != (4, 4):
         raise PoseError(
@@ -107,7 +107,7 @@ def check_rigid(name: str, transforms: FloatArray, tolerance: float = RIGID_TOLE
 
 
 def nearest_rigid(name: str, transforms: FloatArray) -> FloatArray:
-    """Transforms (B, 4, 4) with the nearest exact rotations, for numbers rounded in a file.
+    """Return transforms (B, 4, 4) with the nearest exact rotations, for numbers rounded in a file.
 
     Raises PoseError unless they are rigid within 1e-3.
     """
@@ -117,7 +117,7 @@ def nearest_rigid(name: str, transforms: FloatArray) -> FloatArray:
 
 
 def compose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """Homogeneous transforms (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
+    """Return transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
     transforms = np.zeros((*rotation.shape[:-2], 4, 4))
     transforms[..., :3, :3] = rotation
     transforms[..., :3, 3] = translation
@@ -126,19 +126,19 @@ def compose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
 
 
 def inverse(transforms: FloatArray) -> FloatArray:
-    """The inverse of rigid transforms (..., 4, 4)."""
+    """Return the inverse of rigid transforms (..., 4, 4)."""
     rotation = np.swapaxes(transforms[..., :3, :3], -1, -2)
     return compose(rotation, -rotated(rotation, transforms[..., :3, 3]))
 
 
 def apply(transforms: FloatArray, points: FloatArray) -> FloatArray:
-    """Points (N, 3) moved by transforms (..., 4, 4): (..., N, 3)."""
+    """Return points (N, 3) moved by transforms (..., 4, 4): (..., N, 3)."""
     moved = np.einsum("...ij,nj->...ni", transforms[..., :3, :3], points)
     return moved + transforms[..., None, :3, 3]
 
 
 def interpolated(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatArray:
-    """Transforms (N, 4, 4) at fractions (N,) of the way from first to second (N, 4, 4)."""
+    """Return transforms (N, 4, 4) at fractions (N,) of the way from first to second (N, 4, 4)."""
     t = np.asarray(fraction, dtype=np.float64)[:, None]
     position = (1.0 - t) * first[:, :3, 3] + t * second[:, :3, 3]
     turned = slerp(quaternions(first[:, :3, :3]), quaternions(second[:, :3, :3]), fraction)
@@ -146,28 +146,28 @@ def interpolated(first: FloatArray, second: FloatArray, fraction: FloatArray) ->
 
 
 def product(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Matrix products (..., 3, 3) of (..., 3, 3), each sum in the order of its index."""
+    """Return matrix products (..., 3, 3) of (..., 3, 3), each sum in the order of its index."""
     total = left[..., :, 0, None] * right[..., None, 0, :]
     total = total + left[..., :, 1, None] * right[..., None, 1, :]
     return total + left[..., :, 2, None] * right[..., None, 2, :]
 
 
 def rotated(rotation: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Vectors (..., 3) multiplied by rotations (..., 3, 3), each sum in the order of its index."""
+    """Return vectors (..., 3) times rotations (..., 3, 3), sums in the order of indices."""
     total = rotation[..., 0] * vectors[..., 0, None]
     total = total + rotation[..., 1] * vectors[..., 1, None]
     return total + rotation[..., 2] * vectors[..., 2, None]
 
 
 def axis_angle(axis: FloatArray, angle: FloatArray | float) -> FloatArray:
-    """Rotations (..., 3, 3) about unit axes (..., 3) by angles (...) in radians (Rodrigues)."""
+    """Return rotations (..., 3, 3) about unit axes (..., 3) by angles (...), radians."""
     sine, cosine = (values[..., None, None] for values in sines_cosines(angle))
     outer = axis[..., :, None] * axis[..., None, :]
     return cosine * np.eye(3) + sine * hat(axis) + (1.0 - cosine) * outer
 
 
 def hat(vectors: FloatArray) -> FloatArray:
-    """The matrices (..., 3, 3) of the cross products with vectors (..., 3)."""
+    """Return the matrices (..., 3, 3) of the cross products with vectors (..., 3)."""
     matrices = np.zeros((*vectors.shape, 3))
     matrices[..., 0, 1], matrices[..., 0, 2] = -vectors[..., 2], vectors[..., 1]
     matrices[..., 1, 0], matrices[..., 1, 2] = vectors[..., 2], -vectors[..., 0]
@@ -176,13 +176,13 @@ def hat(vectors: FloatArray) -> FloatArray:
 
 
 def roll_pitch_yaw(angles: FloatArray) -> FloatArray:
-    """The rotation (3, 3) by angles (3,), radians, about the fixed axes x, y, z, in this order."""
+    """Return the rotation (3, 3) by angles (3,), radians, about the fixed axes x, y, z in order."""
     about_x, about_y, about_z = axis_angle(np.eye(3), np.asarray(angles, dtype=np.float64))
     return product(product(about_z, about_y), about_x)
 
 
 def rotation_vector(vectors: FloatArray) -> FloatArray:
-    """Rotations (..., 3, 3) of rotation vectors (..., 3): the exponential map of SO(3)."""
+    """Return rotations (..., 3, 3) of rotation vectors (..., 3): the exponential map of SO(3)."""
     angle = np.sqrt((vectors**2).sum(axis=-1))
     safe = np.where(angle > 0.0, angle, 1.0)
     axis = np.where(angle[..., None] > 0.0, vectors / safe[..., None], [1.0, 0.0, 0.0])
@@ -190,26 +190,26 @@ def rotation_vector(vectors: FloatArray) -> FloatArray:
 
 
 def random_rotations(stream: np.random.Generator, count: int) -> FloatArray:
-    """Rotations (count, 3, 3), uniform on SO(3): normalised Gaussian quaternions."""
+    """Return rotations (count, 3, 3), uniform on SO(3): normalised Gaussian quaternions."""
     drawn = normals(stream, (count, 4))  # w x y z
     unit = drawn / np.sqrt((drawn**2).sum(axis=1, keepdims=True))
     return rotation_matrices(unit[:, [1, 2, 3, 0]])
 
 
 def rotation_angle(rotation: FloatArray) -> FloatArray:
-    """Angles (...) in radians of rotations (..., 3, 3), in [0, pi], accurate for small ones too."""
+    """Return angles (...), radians, of rotations (..., 3, 3), in [0, pi], also of small ones."""
     trace = np.trace(rotation, axis1=-2, axis2=-1)
     return arctangents(np.sqrt((twice_sine_axis(rotation) ** 2).sum(axis=-1)), trace - 1.0)
 
 
 def twice_sine_axis(rotation: FloatArray) -> FloatArray:
-    """2 sin(angle) axis (..., 3) of rotations (..., 3, 3): their skew part."""
+    """Return 2 sin(angle) axis (..., 3) of rotations (..., 3, 3): their skew part."""
     r = np.moveaxis(rotation, (-2, -1), (0, 1))
     return np.stack([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]], axis=-1)
 
 
 def quaternions(rotation: FloatArray) -> FloatArray:
-    """Unit quaternions (N, 4), x y z w, of rotations (N, 3, 3); their sign is arbitrary.
+    """Return unit quaternions (N, 4), x y z w, of rotations (N, 3, 3); their sign is arbitrary.
 
     Each row of the outer product of a quaternion with itself is a multiple of it, and its entries
     follow from the rotation without a root; the row with the largest diagonal entry is used, as it
@@ -231,7 +231,7 @@ def quaternions(rotation: FloatArray) -> FloatArray:
 
 
 def rotation_matrices(quaternion: FloatArray) -> FloatArray:
-    """Rotations (N, 3, 3) of unit quaternions (N, 4), x y z w."""
+    """Return rotations (N, 3, 3) of unit quaternions (N, 4), x y z w."""
     x, y, z, w = quaternion.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -242,7 +242,7 @@ def rotation_matrices(quaternion: FloatArray) -> FloatArray:
 
 
 def slerp(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatArray:
-    """Unit quaternions (N, 4) at fractions (N,) of the shorter arcs from first to second (N, 4).
+    """Return unit quaternions (N, 4) at fractions (N,) of the arcs from first to second (N, 4).
 
     q(t) = (sin((1 - t) a) p + sin(t a) q) / sin a, with the angle a between p and q or -q.
     """
@@ -259,6 +259,6 @@ def slerp(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatA
 
 
 def _product(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Inner products (N, 1) of vectors (N, 4), summed in a fixed order."""
+    """Return inner products (N, 1) of vectors (N, 4), summed in a fixed order."""
     terms = left * right
     return ((terms[:, 0] + terms[:, 1]) + (terms[:, 2] + terms[:, 3]))[:, None]

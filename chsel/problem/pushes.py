@@ -8,9 +8,9 @@ import numpy as np
 
 from chsel.errors import PointsError, require_positive
 from chsel.numerics.arrays import FloatArray, IntArray, ShapesShown, digest, frozen
-from chsel.problem.points import KnownPoints
+from chsel.numerics.cell_set import voxels_of
+from chsel.problem.points import POINT_CLASSES, KnownPoints
 
-CLASSES = ("free", "occupied", "known")
 _STEPS = 4
 _UNIT = 1e-6  # by which the length of a direction may be off
 
@@ -42,7 +42,7 @@ class Pushes(ShapesShown):
 
     def require_points(self, points: KnownPoints) -> None:
         """Raise PointsError if more points were known before a push than there are."""
-        for name, counts in zip(CLASSES, self.before.T, strict=True):
+        for name, counts in zip(POINT_CLASSES, self.before.T, strict=True):
             here = len(getattr(points, name))
             if (counts > here).any():
                 raise PointsError(
@@ -61,17 +61,17 @@ class Pushes(ShapesShown):
         return digest(self.directions, self.before, np.array([self.largest]))
 
     def carried(self, points: KnownPoints, distance: float, resolution: float) -> KnownPoints:
-        """Where points are on the object now, if every push has moved it by a distance, metres.
+        """Return the points on the object as it is after every push moved it by a distance, metres.
 
         resolution: side of free voxels, metres, each of which keeps the first of its free points:
         what was free is swept again, as it has moved, too.
         """
-        now = {name: np.array(getattr(points, name)) for name in CLASSES}
+        now = {name: np.array(getattr(points, name)) for name in POINT_CLASSES}
         for direction, counts in zip(self.directions, self.before, strict=True):
-            for name, count in zip(CLASSES, counts, strict=True):
+            for name, count in zip(POINT_CLASSES, counts, strict=True):
                 now[name][:count] += distance * direction
         free = now["free"]
-        x, y, z = np.rint((free - free[:1]) / resolution).astype(np.int64).T
+        x, y, z = voxels_of(free, free[:1], resolution).T
         _, first = np.unique((x << 42) + (y << 21) + z, return_index=True)  # within 2^20 voxels
         now["free"] = free[np.sort(first)]
         return replace(points, **now)

@@ -60,7 +60,7 @@ class RegistrationProblem(ShapesShown):
         return digest(text, numbers, key)
 
     def carried(self, distance: float) -> RegistrationProblem:
-        """The problem of an object that stands still where pushes have moved it to.
+        """Return the problem of an object that stands still where pushes have moved it to.
 
         distance: of one push, metres. Its points have moved with it, and there are no pushes left.
         """
@@ -107,7 +107,7 @@ VERDICTS = ("determined", "several modes", "wide", "nothing fits")
 
 @dataclass(frozen=True)
 class Trust:
-    """How far to trust a result: how well it explains the points, and how far it is unique."""
+    """A verdict on a result: how well it explains the points, and how far it is unique."""
 
     noise: float  # standard deviation of the known points on the object, estimated, metres
     outliers: float  # share of known points that are not on the object, estimated
@@ -124,11 +124,11 @@ class Trust:
     # The farthest of the hypotheses that explain the points is so far off the best: the object's
     # centre, metres, and turned, radians, but for symmetries. See `chsel.methods.trust_by`.
     centre_within: float | None = None
-    turn_within: float | None = None
+    turn_within: float | None = None  # radians
     reason: str = ""  # why the verdict is wide, or nearly so, where the spread does not show it
 
     def __str__(self) -> str:
-        """One line for people."""
+        """Return one line for people."""
         verdict = self.verdict
         if self.twins is not None:
             angle, apart = math.degrees(self.twins[0]), 1000.0 * self.twins[1]
@@ -153,7 +153,7 @@ class Trust:
 
     @property
     def _bound(self) -> str:
-        """How far the pose may be off, rounded up; "" where that is not known."""
+        """Text of the pose's error, rounded up; "" if it is not known."""
         if self.centre_within is None or self.turn_within is None or self.verdict == "nothing fits":
             return ""
         off = math.ceil(10_000.0 * self.centre_within) / 10.0
@@ -164,7 +164,7 @@ class Trust:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """As recordings have it, the verdict as the number of its place in VERDICTS."""
+        """Values by the names of recordings, the verdict as its index in VERDICTS."""
         later = {
             "spread_limit": self.limit,
             "centre_within": self.centre_within,
@@ -228,18 +228,18 @@ class Observer(Protocol):
     snapshot_interval: int
 
     def progress(self, stage: str, iteration: int, total: int) -> None:
-        """A stage has finished `iteration` of `total` iterations."""
+        """Take note that a stage has finished `iteration` of `total` iterations."""
         return
 
     def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
-        """State of a stage at its start and after blocks of iterations.
+        """Take the state of a stage at its start and after blocks of iterations.
 
         vectors (B, d): of the search; in quality-diversity search, of all elites. cost (B,).
         """
         return
 
     def snapshot(self, archive: ArchiveSnapshot) -> None:
-        """The archive at this moment."""
+        """Take the archive at this moment."""
         return
 
 

@@ -43,7 +43,7 @@ _NORMAL_RANGE = 1e-3  # metres; nearer to the surface, the face normal is the be
 
 
 def mesh_sdf(mesh: trimesh.Trimesh, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Exact signed distance (N,) in metres and its unit gradient (N, 3) at points (N, 3).
+    """Return exact signed distance (N,) in metres and its unit gradient (N, 3) at points (N, 3).
 
     Negative inside, which is where the winding number is above one half. It also holds for open
     meshes, where the one used is approximate, and for scans with folds, where pseudonormals fail.
@@ -56,7 +56,7 @@ def mesh_sdf(mesh: trimesh.Trimesh, points: FloatArray) -> tuple[FloatArray, Flo
 def _mesh_sdf(
     mesh: trimesh.Trimesh, points: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """As `mesh_sdf`, and whether points (N,) are inside of the surface of a closed mesh twice."""
+    """Return `mesh_sdf`, and flags (N,) of points inside of the surface of a closed mesh twice."""
     import igl
 
     vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
@@ -223,7 +223,7 @@ class SdfGrid(ShapesShown):
         return np.concatenate([self.values[..., None], self.gradients], axis=-1).reshape(-1, 4)
 
     def derived(self, key: Hashable, make: Callable[[], Derived]) -> Derived:
-        """The value of `make()`, kept under a key for as long as the grid lives."""
+        """Return the value of `make()`, kept under a key for as long as the grid lives."""
         if key not in self._derived:
             self._derived[key] = make()
         value: Derived = self._derived[key]
@@ -234,7 +234,7 @@ class SdfGrid(ShapesShown):
         return {}
 
     def active_cells(self, level: float, lookup: str) -> BoolArray:
-        """Whether cells (nx, ny, nz) read any value below `level`.
+        """Return whether cells (nx, ny, nz) read any value below `level`.
 
         A cell is that around a node for lookup "nearest", and beyond a node for "trilinear".
         """
@@ -251,7 +251,7 @@ class SdfGrid(ShapesShown):
     def at(
         self, points: FloatArray, *, lookup: str = "nearest", outside: str = "surface_point"
     ) -> tuple[FloatArray, FloatArray]:
-        """Signed distance (P,) and gradient (P, 3) at object-frame points (P, 3).
+        """Return signed distance (P,) and gradient (P, 3) at object-frame points (P, 3).
 
         lookup "nearest" takes the nearest node, ties to even (CHSEL, Sec. IV-B); "trilinear"
         interpolates values and gradients. Outside of the grid, "surface_point" returns the
@@ -267,7 +267,7 @@ class SdfGrid(ShapesShown):
         if lookup == "nearest":
             rows = self._rows(np.rint(cell))
         else:
-            base = np.minimum(np.floor(cell), np.array(self.shape) - 2.0)
+            base = self.lowest_nodes(cell)
             fraction, rows = cell - base, np.zeros((len(cell), 4))
             sides = (1.0 - fraction, fraction)
             for corner in np.ndindex(2, 2, 2):
@@ -286,13 +286,18 @@ class SdfGrid(ShapesShown):
             gradient[beyond] = away / distance
         return value, gradient
 
+    def lowest_nodes(self, coordinates: FloatArray) -> FloatArray:
+        """Return the lowest nodes (P, 3) of the cells that hold grid coordinates (P, 3)."""
+        lowest: FloatArray = np.minimum(np.floor(coordinates), np.array(self.shape) - 2.0)
+        return lowest
+
     def _rows(self, nodes: FloatArray) -> FloatArray:
-        """Value and gradient (P, 4) of nodes (P, 3)."""
+        """Return value and gradient (P, 4) of nodes (P, 3)."""
         return self.table[np.ravel_multi_index(tuple(nodes.astype(np.int64).T), self.shape)]
 
 
 def _lengths(vectors: FloatArray) -> FloatArray:
-    """Lengths (P, 1) of vectors (P, 3), of at least 1e-12, summed in the order of the axes."""
+    """Return lengths (P, 1) of vectors (P, 3), at least 1e-12, summed in the order of axes."""
     squares = vectors * vectors
     sums = (squares[:, 0:1] + squares[:, 1:2]) + squares[:, 2:3]
     lengths: FloatArray = np.maximum(np.sqrt(sums), 1e-12)
@@ -300,7 +305,7 @@ def _lengths(vectors: FloatArray) -> FloatArray:
 
 
 def _default_spacing(mesh: trimesh.Trimesh, padding: float) -> tuple[float, float]:
-    """Spacing and padding, metres, of a grid of at most DEFAULT_NODES nodes."""
+    """Return spacing and padding, metres, of a grid of at most DEFAULT_NODES nodes."""
     extents = np.asarray(mesh.extents, dtype=np.float64)
     thickness = float(extents.min())
     if not min(thickness, float(mesh.area)) > 0.0:
@@ -345,7 +350,7 @@ def _warn_of_thin_walls(mesh: trimesh.Trimesh, resolution: float) -> None:
 
 
 def wall_thicknesses(mesh: trimesh.Trimesh, below: float) -> FloatArray:
-    """Thickness in metres of the object behind points (S,) all over its surface.
+    """Return thickness in metres of the object behind points (S,) all over its surface.
 
     It is measured straight into the object, and infinite where it is not less than `below`, or the
     way does not end outside of the object, such as where its parts overlap.
@@ -369,7 +374,7 @@ def wall_thicknesses(mesh: trimesh.Trimesh, below: float) -> FloatArray:
 
 
 def _shape(mesh: trimesh.Trimesh, resolution: float, padding: float) -> tuple[int, ...]:
-    """Nodes per axis of the grid of a mesh."""
+    """Return nodes per axis of the grid of a mesh."""
     lower, upper = np.asarray(mesh.bounds, dtype=np.float64)
     span = upper + padding - (lower - padding)
     return tuple(int(n) + 2 for n in np.floor(span / resolution))
@@ -391,7 +396,7 @@ def object_grid(
     padding: float = OBJECT_PADDING,
     progress: Callable[[int, int], None] | None = None,
 ) -> SdfGrid:
-    """The grid of a clean mesh by `SdfGrid.from_mesh`, kept for later calls with this mesh."""
+    """Return the grid of a clean mesh by `SdfGrid.from_mesh`, kept for later calls."""
     key = mesh_digest(mesh), resolution, padding
     grid = _kept.get(key)
     if grid is None:

@@ -16,21 +16,21 @@ from chsel.problem.sdf_grid import SdfGrid
 class DistanceField(NamedTuple):
     """Signed distances and gradients at the nodes of a grid."""
 
-    box: Box
+    box: Box  # of the grid
     table: FloatArray  # (4 nodes,): value and gradient of each node, one after the other
     trilinear: bool  # interpolate, else read the nearest node
     box_distance: bool  # how distances continue outside of the grid, see SdfGrid.at
 
 
 def distance_field(sdf: SdfGrid, lookup: str, outside: str) -> DistanceField:
-    """The signed distance field that kernels read; lookup, outside: see SdfGrid.at."""
+    """Return the signed distance field that kernels read; lookup, outside: see SdfGrid.at."""
     trilinear = lookup == "trilinear"
     box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=trilinear)
     return DistanceField(box, sdf.table.reshape(-1), trilinear, outside == "bounding_box")
 
 
 def cells_below(sdf: SdfGrid, level: float, lookup: str) -> CellSet:
-    """The cells of a grid that read any value below `level`, derived once."""
+    """Return the cells of a grid that read any value below `level`, derived once."""
 
     def make() -> CellSet:
         box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=lookup == "trilinear")
@@ -41,7 +41,7 @@ def cells_below(sdf: SdfGrid, level: float, lookup: str) -> CellSet:
 
 @leaf
 def distance_in_box(field, places, n):
-    """Signed distance and gradient (s, n_x, n_y, n_z) at place n, which is in the box."""
+    """Return signed distance and gradient (s, n_x, n_y, n_z) at place n, which is in the box."""
     table, at = field.table, np.uint64(places.cell[n])
     if field.trilinear:
         u, v, w = places.u[n], places.v[n], places.w[n]
@@ -51,7 +51,7 @@ def distance_in_box(field, places, n):
 
 @leaf
 def at_node(table, node):
-    """Signed distance and gradient of a node."""
+    """Return signed distance and gradient of a node."""
     at = np.uint64(4) * np.uint64(node)
     s, nx = table[at], table[at + np.uint64(1)]
     return s, nx, table[at + np.uint64(2)], table[at + np.uint64(3)]
@@ -59,7 +59,7 @@ def at_node(table, node):
 
 @leaf
 def distance_between_nodes(box, table, base, u, v, w):
-    """The same in the cell whose lowest node is `base`, at fractions u, v, w of its sides."""
+    """Return distance and gradient in the cell of lowest node `base`, at fractions u, v, w."""
     # Unsigned, as an index that may be negative costs more instructions than the sum.
     across, along = np.uint64(np.int64(box.across)), np.uint64(np.int64(box.along))
     lowest, s, nx, ny, nz = np.uint64(base), 0.0, 0.0, 0.0, 0.0
@@ -77,7 +77,7 @@ def distance_between_nodes(box, table, base, u, v, w):
 
 @leaf
 def distance_beyond_box(box_distance, box, inside, x, y, z):
-    """The same at a point x, y, z outside, from `inside` at the nearest point of the box."""
+    """Return distance and gradient at a point x, y, z outside, from those nearest in the box."""
     s, nx, ny, nz = inside
     first, last = box.first, box.last
     ax = x - min(max(x, first[0]), last[0])
@@ -94,7 +94,7 @@ def distance_beyond_box(box_distance, box, inside, x, y, z):
 
 @leaf
 def distance_in_place(field, pose, x, y, z, places, n):
-    """The same of a world point x, y, z, whose place is the n-th, in the box or nearest to it."""
+    """Return distance and gradient of a world point x, y, z, whose place is the n-th."""
     inside = distance_in_box(field, places, n)
     if places.beyond[n] > 0.0:
         x, y, z = moved(pose, x, y, z)
@@ -104,7 +104,7 @@ def distance_in_place(field, pose, x, y, z, places, n):
 
 @leaf
 def distance_at(field, pose, x, y, z):
-    """Interpolated signed distance at a world point."""
+    """Return interpolated signed distance at a world point."""
     box, table = field.box, field.table
     a, b, c = moved(pose, x, y, z)
     cell, is_beyond = cell_of(box, a, b, c)
@@ -117,7 +117,7 @@ def distance_at(field, pose, x, y, z):
 
 @leaf
 def distance_with_gradient(field, pose, x, y, z):
-    """Interpolated signed distance and gradient (s, n_x, n_y, n_z) at a world point."""
+    """Return interpolated signed distance and gradient (s, n_x, n_y, n_z) at a world point."""
     box, table = field.box, field.table
     a, b, c = moved(pose, x, y, z)
     cell, is_beyond = cell_of(box, a, b, c)
@@ -130,7 +130,7 @@ def distance_with_gradient(field, pose, x, y, z):
 
 @leaf
 def cell_of(box, a, b, c):
-    """The arguments of `value_between_nodes`; and whether a point is beyond the box.
+    """Return the arguments of `value_between_nodes`; and whether a point is beyond the box.
 
     Of the nearest point of the box, then.
     """
@@ -155,7 +155,7 @@ def _row_in_cell(box, table, cell):
 
 @leaf
 def value_between_nodes(table, at, across, along, u, v, w):
-    """Signed distance in the cell whose lowest node is `at`, at fractions u, v, w of its sides."""
+    """Return the distance in the cell of lowest node `at`, at fractions u, v, w of its sides."""
     low, high = 1.0 - w, w
     next_node = np.uint64(4)
     at, along = next_node * np.uint64(at), next_node * np.uint64(along)

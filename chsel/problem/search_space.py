@@ -25,10 +25,10 @@ class SearchSpace(ABC):
 
     @abstractmethod
     def encode(self, poses: Poses) -> FloatArray:
-        """Vectors (B, d) of poses, or of the nearest poses in the space."""
+        """Return vectors (B, d) of poses, or of the nearest poses in the space."""
 
     def poses(self, vectors: FloatArray) -> Poses:
-        """The poses of vectors (B, d)."""
+        """Return the poses of vectors (B, d)."""
         numbers = np.empty((len(vectors), 12))
         decode_all(self.arrays, np.array(vectors, dtype=np.float64), numbers)
         return Poses(numbers)
@@ -41,7 +41,7 @@ class SE3Space(SearchSpace):
     arrays = SpaceConstants()
 
     def encode(self, poses: Poses) -> FloatArray:
-        """The 9-D vectors of poses."""
+        """Return the 9-D vectors of poses."""
         return poses.vectors
 
 
@@ -104,7 +104,7 @@ class SE2Space(SearchSpace):
         return (self.resting_rotation * self.axis[:, None]).sum(axis=0)
 
     def encode(self, poses: Poses) -> FloatArray:
-        """The vectors of the nearest poses on the plane, by the Frobenius norm of rotations."""
+        """Return the vectors of the nearest poses on the plane by the Frobenius norm."""
         turned = product(poses.rotations, self.resting_rotation.T)
         sine = (twice_sine_axis(turned) * self.axis).sum(axis=1)
         along = (rotated(turned, self.axis) * self.axis).sum(axis=1)
@@ -114,14 +114,14 @@ class SE2Space(SearchSpace):
 
 
 def search_space(plane: PlaneSettings | None, sdf: SdfGrid) -> SearchSpace:
-    """SE(3), or SE(2) on a plane."""
+    """Return SE(3), or SE(2) on a plane."""
     return SE3Space() if plane is None else SE2Space(plane, sdf)
 
 
 def origin_bounds(
     workspace: Workspace, space: SearchSpace, margin: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Bounds (3,) of the object's origin: the workspace plus a margin in metres.
+    """Return bounds (3,) of the object's origin: the workspace plus a margin in metres.
 
     For an object on a plane, the margin grows until the bounds meet the plane.
     """
@@ -135,7 +135,7 @@ def origin_bounds(
 
 
 def _lowest_point(sdf: SdfGrid, axis: FloatArray) -> float:
-    """The least a . x on the object's surface, from the grid's nodes near the surface."""
+    """Return the least a . x on the object's surface, from the grid's nodes near the surface."""
     near = np.abs(sdf.values) < 2.0 * sdf.resolution
     nodes = sdf.origin + np.argwhere(near) * sdf.resolution
     surface = nodes - sdf.values[near][:, None] * sdf.gradients[near]

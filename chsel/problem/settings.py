@@ -43,17 +43,17 @@ not_negative = partial(require_positive, zero=True)
 
 
 def at_most(most: float) -> Check:
-    """A number of at most `most`."""
+    """Return a number of at most `most`."""
     return partial(require_at_most, most=most)
 
 
 def between(low: float, high: float) -> Check:
-    """A length from `low` to `high`, metres."""
+    """Return a length from `low` to `high`, metres."""
     return partial(require_between, low=low, high=high)
 
 
 def one_of(*accepted: str) -> Check:
-    """One of the accepted names."""
+    """Return one of the accepted names."""
     return partial(require_choice, accepted=accepted)
 
 
@@ -110,7 +110,7 @@ def build_settings(
 
 
 def changed_settings(settings: Settings, changes: Mapping[str, Any], where: str) -> Settings:
-    """`settings` with changes laid over them, group by group; nothing else changes.
+    """Return `settings` with changes laid over them, group by group; nothing else changes.
 
     Raises SettingError as `build_settings` does.
     """
@@ -118,12 +118,12 @@ def changed_settings(settings: Settings, changes: Mapping[str, Any], where: str)
 
 
 def settings_mapping(settings: Any) -> dict[str, Any]:
-    """The plain nested mapping that `build_settings` turns back into equal settings."""
+    """Return the plain nested mapping that `build_settings` turns back into equal settings."""
     return dataclasses.asdict(settings)
 
 
 def _convert(hint: Any, value: Any, where: str, before: Any = None) -> Any:
-    """`value` as the annotated type `hint`, or SettingError; a group is laid over `before`."""
+    """Return `value` as the annotated type `hint`, or SettingError; groups lie over `before`."""
     if typing.get_origin(hint) is Annotated:
         hint = hint.__origin__
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
@@ -157,7 +157,7 @@ def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[
 
 
 def in_preset(settings: Settings, preset: str) -> Settings:
-    """Settings of the preset `default` as another one of `PRESETS` has them.
+    """Return settings of the preset `default` as another one of `PRESETS` has them.
 
     Each group of settings changes as its own class says, then what `presets` of this class names.
     A class without `presets` is the same in all of them, with its groups.
@@ -184,11 +184,11 @@ class NamedChoices(Generic[Made]):
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """All names: ours in their order, then those of installed packages."""
+        """Names of the choices: ours in their order, then those of installed packages."""
         return (*self.ours, *(name for name in sorted(self._offers) if name not in self.ours))
 
     def entry(self, name: str) -> Entry[Made]:
-        """What makes a choice of its settings, and its settings by default.
+        """Return the class of a choice, and its settings by default.
 
         Raises SettingError for a name that does not exist, and for a choice of an installed package
         that cannot be imported, is not of this kind, or has two packages.
@@ -199,14 +199,14 @@ class NamedChoices(Generic[Made]):
         return self._entries[name]
 
     def settings(self, name: str, preset: str = "default") -> Any:
-        """The settings of a choice by name in a preset, one of PRESETS; SettingError if none is."""
+        """Return the settings of a choice by name in a preset of PRESETS; else SettingError."""
         make, default = self.entry(name)
         require_choice("preset", preset, PRESETS)
         in_own_preset = getattr(make, "preset", None)
         return in_own_preset(preset) if in_own_preset else in_preset(default, preset)
 
     def build(self, name: str, settings: Any = None) -> Made:
-        """A choice, such as a method or a policy, by name.
+        """Return a choice, such as a method or a policy, by name.
 
         settings: its settings, or a mapping of changes to those of the preset `default`. Raises
         SettingError for names and values that do not exist, and for a name of ours that an
@@ -248,7 +248,7 @@ class NamedChoices(Generic[Made]):
         return offered, settings
 
     def _packages(self, name: str) -> list[str]:
-        """The installed packages that offer a choice of that name."""
+        """Return the installed packages that offer a choice of that name."""
         return sorted(point.dist.name if point.dist else "unknown" for point in self._offers[name])
 
     @cached_property
@@ -258,7 +258,7 @@ class NamedChoices(Generic[Made]):
 
     @cached_property
     def _offers(self) -> dict[str, list[EntryPoint]]:
-        """All entry points of the group, by their names."""
+        """Entry points of the group by their names."""
         offers: dict[str, list[EntryPoint]] = {}
         for point in entry_points(group=self.group):
             offers.setdefault(point.name, []).append(point)

@@ -22,7 +22,7 @@ LAST_STEP = 2**32 - 1  # of a session; random streams distinguish no more steps
 
 
 class Purpose(IntEnum):
-    """What random numbers are used for. Recordings depend on the values: never renumber them."""
+    """Uses of random numbers. Recordings depend on the values: never renumber them."""
 
     INITIAL_POSES = 1
     UPDATE_NOISE = 2
@@ -65,12 +65,12 @@ class StreamKey:
             object.__setattr__(self, name, int(value))
 
     def stream(self, purpose: Purpose, index: int = 0) -> np.random.Generator:
-        """The Philox stream of one purpose; `index` distinguishes repetitions within a step."""
+        """Return the Philox stream of one purpose; `index` tells repetitions in a step apart."""
         key = (self._word(purpose, index) << 64) | self.seed
         return np.random.Generator(np.random.Philox(key=key))
 
     def kernel_stream(self, purpose: Purpose, index: int = 0) -> Stream:
-        """The same stream for kernels, which draw from it by `fill_uniforms`."""
+        """Return the stream for kernels, which draw from it by `fill_uniforms`."""
         return Stream(np.uint64(self.seed), np.uint64(self._word(purpose, index)))
 
     def _word(self, purpose: Purpose, index: int) -> int:
@@ -83,13 +83,13 @@ def uniforms(
     upper: ArrayLike,
     shape: int | tuple[int, ...],
 ) -> FloatArray:
-    """Numbers of a shape, uniform in [lower, upper)."""
+    """Return numbers of a shape, uniform in [lower, upper)."""
     lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     return lower + (upper - lower) * stream.random(shape)
 
 
 def normals(stream: np.random.Generator, shape: int | tuple[int, ...]) -> FloatArray:
-    """Standard normal numbers of a shape, in C order (Box and Muller).
+    """Return standard normal numbers of a shape, in C order (Box and Muller).
 
     Numbers 2i and 2i + 1 are r cos(a) and r sin(a), with r = sqrt(-2 ln(1 - u)) and a = 2 pi v,
     where u and v are the uniform numbers 2i and 2i + 1 of the stream, in [0, 1). The last sine is
@@ -124,7 +124,7 @@ class Stream(NamedTuple):
 
 @_intrinsic
 def _product(context: Any, a: Any, b: Any) -> Any:
-    """The upper and the lower word of a product of two 64-bit words."""
+    """Return the upper and the lower word of a product of two 64-bit words."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         wide, word = ir.IntType(128), ir.IntType(64)
@@ -138,7 +138,7 @@ def _product(context: Any, a: Any, b: Any) -> Any:
 
 @leaf
 def _block(stream, number):
-    """The four words of a block by its number, from 0."""
+    """Return the four words of a block by its number, from 0."""
     a, b, c, d = np.uint64(number) + _ONE, _NONE, _NONE, _NONE
     low, high = stream.low, stream.high
     for _ in range(_ROUNDS):
@@ -166,11 +166,11 @@ def fill_uniforms(stream, first, out, at, count):
     number, skipped = first // _PER_BLOCK, first % _PER_BLOCK
     for n in range((skipped + count + _PER_BLOCK - 1) // _PER_BLOCK):
         a, b, c, d = _block(stream, number + n)
-        place = at + n * _PER_BLOCK
-        _put(a, out, place)
-        _put(b, out, place + 2)
-        _put(c, out, place + 4)
-        _put(d, out, place + 6)
+        to = at + n * _PER_BLOCK
+        _put(a, out, to)
+        _put(b, out, to + 2)
+        _put(c, out, to + 4)
+        _put(d, out, to + 6)
     if skipped > 0:
         for n in range(at, at + count):
             out[n] = out[n + skipped]

@@ -16,24 +16,24 @@ from chsel.problem.surface import surface_distances, surface_points
 _PLACES = 64  # of a descriptor
 
 
-def farthest_points(points: FloatArray, most: int, *, given: int = 0) -> IntArray:
-    """Indices of at most `most` of points (N, d), each the farthest from those before it.
+def farthest_points(points: FloatArray, most: int, *, chosen_first: int = 0) -> IntArray:
+    """Return indices of at most `most` of points (N, d), each the farthest from those before it.
 
-    The first `given` points come first, in their order.
+    The first `chosen_first` points come first, in their order.
     """
     chosen = np.zeros(min(most, len(points)), dtype=np.int64)
     points = np.ascontiguousarray(points, dtype=np.float64)
-    choose_farthest(points, given, chosen, np.full(len(points), np.inf))
+    choose_farthest(points, chosen_first, chosen, np.full(len(points), np.inf))
     return chosen
 
 
 def farthest_poses(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
-    """Indices of at most `count` poses, each the farthest from those before it by descriptors."""
+    """Return indices of at most `count` poses, each the farthest from those before it."""
     return farthest_points(surface_descriptors(sdf, poses), count)
 
 
 def representative_poses(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
-    """Indices of poses such that every pose is near to one of them; the first is always chosen.
+    """Return indices of poses such that every pose is near one of them, the first included.
 
     Fewer than `count` if all others have the same descriptors as chosen ones.
     """
@@ -42,27 +42,27 @@ def representative_poses(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
 
 
 def squared_distances(sdf: SdfGrid, poses: Poses) -> FloatArray:
-    """Squared distances (B, B) of poses from each other by their descriptors (B, 64)."""
+    """Return squared distances (B, B) of poses from each other by their descriptors (B, 64)."""
     apart = np.empty((len(poses), len(poses)))
     fill_apart(np.ascontiguousarray(surface_descriptors(sdf, poses).T), apart)
     return apart
 
 
-def facilities(costs: FloatArray, given: IntArray, count: int, prices: FloatArray) -> IntArray:
-    """At most `count` of B facilities for C clients, chosen greedily: the given ones come first.
+def facilities(costs: FloatArray, first: IntArray, count: int, prices: FloatArray) -> IntArray:
+    """Return at most `count` of B facilities for C clients, greedily: those in `first` come first.
 
     costs (C, B), not negative, of serving each client from each facility. Every other one chosen
     makes the sum of what all clients cost, each from the cheapest facility so far, and of its own
     price (B,), the least. One from which its own client costs nothing more is not chosen.
     """
     chosen = np.zeros(min(count, len(prices)), dtype=np.int64)
-    chosen[: len(given)] = given
-    located = locate_facilities(costs, prices, len(given), chosen, np.empty((2, len(prices))))
+    chosen[: len(first)] = first
+    located = locate_facilities(costs, prices, len(first), chosen, np.empty((2, len(prices))))
     return chosen[:located]
 
 
 def surface_descriptors(sdf: SdfGrid, poses: Poses) -> FloatArray:
-    """Distances in metres (B, 64) from fixed places in the world to the object's surface.
+    """Return distances in metres (B, 64) from fixed places in the world to the object's surface.
 
     The places lie on the surface in some of the poses, so descriptors differ as much as posed
     surfaces do: not at all between poses that a symmetry of the object maps to each other.
@@ -78,11 +78,11 @@ def surface_descriptors(sdf: SdfGrid, poses: Poses) -> FloatArray:
 
 
 @compiled
-def choose_farthest(points: Any, given: Any, chosen: Any, squared: Any) -> None:
+def choose_farthest(points: Any, first: Any, chosen: Any, squared: Any) -> None:
     """Fill `chosen` with indices of points (N, d). squared (N,): infinite, then scratch."""
     for n in range(len(chosen)):
         best = n
-        if n >= given:
+        if n >= first:
             best = 0
             for i in range(1, len(points)):
                 best = i if squared[i] > squared[best] else best
@@ -94,7 +94,7 @@ def choose_farthest(points: Any, given: Any, chosen: Any, squared: Any) -> None:
 
 @leaf
 def _squared_distance(one: Any, other: Any) -> Any:
-    """The squared distance of two points (d,), in eight sums side by side, and what is left."""
+    """Return the squared distance of two points (d,), in eight sums side by side."""
     size, total = len(one), 0.0
     whole = size // 8 * 8
     if whole > 0:
@@ -115,8 +115,8 @@ def _squared_distance(one: Any, other: Any) -> Any:
 
 
 @compiled
-def locate_facilities(apart: Any, prices: Any, given: Any, chosen: Any, rows: Any) -> Any:
-    """Fill `chosen` (B,) after those given; apart (C, C) is `costs` of `facilities`.
+def locate_facilities(apart: Any, prices: Any, first: Any, chosen: Any, rows: Any) -> Any:
+    """Fill `chosen` (B,) after the `first` of them; apart (C, C) is `costs` of `facilities`.
 
     rows (2, C): scratch. Returns the number of chosen ones, less than B if all others are served
     for nothing.
@@ -126,7 +126,7 @@ def locate_facilities(apart: Any, prices: Any, given: Any, chosen: Any, rows: An
     for i in range(count):
         nearest[i] = np.inf
     for n in range(len(chosen)):
-        if n >= given:
+        if n >= first:
             _fill_totals(nearest, apart, prices, totals)
             best, least = -1, np.inf
             for i in range(count):
@@ -142,7 +142,7 @@ def locate_facilities(apart: Any, prices: Any, given: Any, chosen: Any, rows: An
 
 @compiled
 def fill_apart(points: Any, apart: Any) -> None:
-    """Squared distances of points (d, C) from each other; four dimensions in a pass."""
+    """Fill `apart` with squared distances of points (d, C) from each other, four axes in a pass."""
     dimension, count = points.shape
     for i in range(count):
         for j in range(i):
@@ -165,7 +165,7 @@ def fill_apart(points: Any, apart: Any) -> None:
 
 @inner
 def _fill_totals(nearest: Any, apart: Any, prices: Any, totals: Any) -> None:
-    """What the sum of costs and of its price becomes with each (C,); four rows in a pass."""
+    """Fill totals (C,) with the sum of costs and price if each is chosen; four rows in a pass."""
     count = len(totals)
     fours = count // 4 * 4
     for i in range(count):

@@ -32,7 +32,7 @@ _TRIANGLES = {
 
 
 def surface_points(sdf: SdfGrid, count: int, stream: np.random.Generator) -> FloatArray:
-    """Points (count, 3) in the object frame, metres, uniform by area on the surface of a grid.
+    """Return points (count, 3) in the object frame, metres, uniform by area on the surface.
 
     Drawn on the zero level of the grid's values, linear on tetrahedra between nodes, then moved by
     one Newton step that uses the gradients too. Flat sides are exact, edges are cut off by less
@@ -58,25 +58,25 @@ def surface_points(sdf: SdfGrid, count: int, stream: np.random.Generator) -> Flo
 
 
 def has_surface(sdf: SdfGrid) -> bool:
-    """Whether some nodes of a grid are inside of the object, and some are not."""
+    """Return whether some nodes of a grid are inside of the object, and some are not."""
     inside = sdf.values < 0.0
     return bool(inside.any() and not inside.all())
 
 
 def object_centre(sdf: SdfGrid) -> FloatArray:
-    """The mean (3,) of points on the surface of a grid, in the object frame."""
+    """Return the mean (3,) of points on the surface of a grid, in the object frame."""
     stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
     return sdf.derived("centre", lambda: surface_points(sdf, _CENTRE_POINTS, stream).mean(axis=0))
 
 
 def _refined(sdf: SdfGrid, points: FloatArray) -> FloatArray:
-    """Points (P, 3) moved by - s n, with s = sum w_i (s_i + g_i . (x - x_i) / 2) over 8 nodes.
+    """Return points (P, 3) - s n, with s = sum w_i (s_i + g_i . (x - x_i) / 2) over 8 nodes.
 
     On a curved surface, interpolated values err to one side and values extrapolated along gradients
     as much to the other; the error of their mean is of third order in the resolution.
     """
     cell = (points - sdf.origin) / sdf.resolution
-    base = np.minimum(np.floor(cell), np.array(sdf.shape) - 2).astype(np.int64)
+    base = sdf.lowest_nodes(cell).astype(np.int64)
     signed, normal = np.zeros(len(points)), np.zeros(points.shape)
     for corner in np.ndindex(2, 2, 2):
         away = cell - (base + corner)
@@ -94,7 +94,7 @@ def _refined(sdf: SdfGrid, points: FloatArray) -> FloatArray:
 
 
 def _zero_level(sdf: SdfGrid) -> FloatArray:
-    """Triangles (T, 3, 3) of the surface, in the order of the cells."""
+    """Return triangles (T, 3, 3) of the surface, in the order of the cells."""
     inside = sdf.values < 0.0
     nx, ny, nz = sdf.shape
     offsets = list(np.ndindex(2, 2, 2))
@@ -109,7 +109,7 @@ def _zero_level(sdf: SdfGrid) -> FloatArray:
 def _triangles(
     sdf: SdfGrid, nodes: IntArray, inside: int, triangles: tuple[tuple[tuple[int, int], ...], ...]
 ) -> FloatArray:
-    """Triangles (T, 3, 3) in the tetrahedra (P, 4, 3) that have `inside` corners inside."""
+    """Return triangles (T, 3, 3) in the tetrahedra (P, 4, 3) that have `inside` corners inside."""
     values = sdf.values[nodes[..., 0], nodes[..., 1], nodes[..., 2]]
     chosen = (values < 0.0).sum(axis=1) == inside
     nodes, values = nodes[chosen], values[chosen]
@@ -128,7 +128,7 @@ _POINTS = 100
 
 
 def outline_distances(sdf: SdfGrid, poses: Poses) -> FloatArray:
-    """How far the object's surface in a pose is from that in another (B, B), metres.
+    """Return distances (B, B), metres, of the object's surfaces in poses from each other.
 
     Root mean square over points of both surfaces: 0 between poses that a symmetry maps to each
     other. As exact as the grid's interpolation, a fraction of its resolution.
@@ -142,7 +142,7 @@ def outline_distances(sdf: SdfGrid, poses: Poses) -> FloatArray:
 
 
 def surface_spread(distances: FloatArray, weights: FloatArray | None = None) -> float:
-    """Root mean square distance of the surfaces in two poses drawn from a set, metres.
+    """Return root mean square distance of the surfaces in two poses drawn from a set, metres.
 
     This is the spread of hypotheses and of beliefs. distances (B, B), metres: `outline_distances`.
     weights (B,): with which poses are drawn, each again; None: all alike.
@@ -153,7 +153,7 @@ def surface_spread(distances: FloatArray, weights: FloatArray | None = None) -> 
 
 
 def outline_distances_to(sdf: SdfGrid, poses: Poses, other: Poses) -> FloatArray:
-    """How far the object's surface in each pose is from that in one other pose (B,), metres.
+    """Return distances (B,), metres, of the object's surface in each pose from that in another.
 
     As in `outline_distances`. other: a single pose.
     """
@@ -166,30 +166,30 @@ def outline_distances_to(sdf: SdfGrid, poses: Poses, other: Poses) -> FloatArray
 
 
 def outline_in_world(sdf: SdfGrid, poses: Poses) -> FloatArray:
-    """Points (B, Q, 3) on the object's surface in each pose; Q is 0 for a grid without surface."""
+    """Return points (B, Q, 3) on the object's surface in each pose; Q is 0 without a surface."""
     turns = np.swapaxes(poses.rotations, 1, 2)
     return rotated(turns[:, None], outline_in_object(sdf) - poses.translations[:, None])
 
 
 def outline_in_object(sdf: SdfGrid) -> FloatArray:
-    """Points (Q, 3) on the object's surface, object frame."""
+    """Return points (Q, 3) on the object's surface, object frame."""
     return sdf.derived("outline", lambda: _outline(sdf))
 
 
 def signed_distances(sdf: SdfGrid, poses: Poses, points: FloatArray) -> FloatArray:
-    """Signed distances (B, N), metres, of world points (N, 3), at most FARTHEST."""
+    """Return signed distances (B, N), metres, of world points (N, 3), at most FARTHEST."""
     return np.minimum(surface_distances(sdf, poses, points), FARTHEST)
 
 
 def in_order(values: FloatArray) -> FloatArray:
-    """Sums along the last axis, added in their order, so that they are the same everywhere."""
+    """Return sums along the last axis, added in their order: the same on every machine."""
     if values.shape[-1] == 0:
         return np.zeros(values.shape[:-1])
     return np.cumsum(values, axis=-1)[..., -1]
 
 
 def _outline(sdf: SdfGrid) -> FloatArray:
-    """Points (Q, 3) on the object's surface, object frame; none if the grid has no surface."""
+    """Return points (Q, 3) on the object's surface, object frame; none without a surface."""
     if has_surface(sdf):
         return surface_points(sdf, _POINTS, StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
     near = np.argwhere(np.abs(sdf.values) < 2.0 * sdf.resolution)  # of objects thinner than that
@@ -201,7 +201,7 @@ def _outline(sdf: SdfGrid) -> FloatArray:
 
 
 def surface_distances(sdf: SdfGrid, poses: Poses, points: FloatArray) -> FloatArray:
-    """Signed distances (B, N), metres, of world points (N, 3) to the object's surface in poses."""
+    """Return signed distances (B, N), metres, of world points (N, 3) to the surface in poses."""
     field = distance_field(sdf, "trilinear", "surface_point")
     numbers, places = np.array(poses.numbers), np.array(points)
     distances = np.empty((len(poses), len(points)))

@@ -1,4 +1,4 @@
-"""How far to trust hypotheses: whether they explain the points, and whether they are alike.
+"""The trust in hypotheses: whether they explain the points, and whether they are alike.
 
 The set is judged by the object's signed distances, whatever the method and its cost are.
 docs/trust.md has the model, and what its limits were chosen on.
@@ -78,7 +78,7 @@ def trust_in(
     sensor_noise: float = SENSOR_NOISE,
     rivals: Poses | None = None,
 ) -> Trust:
-    """How far to trust the hypotheses of a problem; a pure function, the same bits everywhere.
+    """Return the trust in the hypotheses of a problem: a pure function, the same bits everywhere.
 
     sensor_noise: standard deviation of known points by the sensor's datasheet, metres. rivals:
     further poses, which speak against the best hypothesis where they fit; with less than
@@ -86,6 +86,8 @@ def trust_in(
     Raises PoseError if there is no hypothesis or the best is not finite, and SettingError for noise
     that is not above 0.
     """
+    from scipy.sparse.csgraph import connected_components  # which takes long to import
+
     require_positive("sensor_noise", sensor_noise)
     problem = problem.carried(hypotheses.push_distance)
     sdf, points = problem.sdf, problem.points
@@ -102,7 +104,7 @@ def trust_in(
     width = max(MOST_WIDTH * sdf.diameter, LEAST_LEVELS * sensor_noise)
     gap = max(width, LEAST_GAP * noise.sigma)
     near = apart <= gap
-    count, mode = _components(near & ~turned(sdf, poses, near))
+    count, mode = connected_components(near & ~turned(sdf, poses, near), directed=False)
     parts = [np.flatnonzero(mode == one) for one in range(count)]
     redundancy = max(len(off) - FREEDOMS, 0)
     why = ""
@@ -153,19 +155,19 @@ def explaining(
     sensor_noise: float,
     rivals: Poses | None = None,
 ) -> tuple[Poses, IntArray]:
-    """The poses (K, 12) that explain the points, the best hypothesis first, and their indices (K,).
+    """Return the poses (K, 12) that explain the points, best hypothesis first, and indices (K,).
 
     Arguments and errors as of `trust_in`, but that no push is left; the index of a rival is -1.
     """
     poses, indices = _compared(hypotheses)
-    own = len(poses)
+    count = len(poses)
     if rivals is not None:
         poses = Poses.joined([poses, rivals])
         indices = np.concatenate([indices, np.full(len(rivals), -1)])
     energies = pose_energies(problem, poses, noise_model(sensor_noise))
     allowed = np.full(len(poses), energies.min() + LIMIT)
     if len(problem.points.known) < MANY_CONTACTS:
-        allowed[own:] += FOREIGN_CONTACT
+        allowed[count:] += FOREIGN_CONTACT
     likely = energies <= allowed
     likely[0] = True
     return poses[likely], indices[likely]
@@ -178,7 +180,7 @@ def fits_elsewhere(
     poses: Poses,
     sensor_noise: float,
 ) -> bool:
-    """Whether a pose far from the best hypothesis explains another problem about as well as that.
+    """Return whether a pose far from the best explains another problem about as well.
 
     problem, other: of one object, that pushes have moved by different distances.
     """
@@ -190,10 +192,10 @@ def fits_elsewhere(
 
 
 def turned(sdf: SdfGrid, poses: Poses, pairs: BoolArray) -> BoolArray:
-    """Which of some pairs (B, B) of poses are turned against each other, and by no symmetry.
+    """Return flags (B, B) of those pairs of poses that differ by a rotation that is no symmetry.
 
-    By more than TURN, and so that the turn about the object's middle moves its surface, root mean
-    square, by more than SYMMETRIC of the diameter.
+    Such a rotation is larger than TURN, and about the object's middle it moves the surface by more
+    than SYMMETRIC of the diameter, root mean square.
     """
     one, other = np.nonzero(np.triu(pairs & (_angles(poses) > TURN), 1))
     result = np.zeros_like(pairs)
@@ -207,7 +209,7 @@ def turned(sdf: SdfGrid, poses: Poses, pairs: BoolArray) -> BoolArray:
 
 
 def middle(sdf: SdfGrid) -> FloatArray:
-    """Centroid (3,) of the object's volume, which every symmetry leaves where it is."""
+    """Return centroid (3,) of the object's volume, which every symmetry leaves where it is."""
     return sdf.derived("middle", lambda: _middle(sdf))
 
 
@@ -221,12 +223,12 @@ def _middle(sdf: SdfGrid) -> FloatArray:
 
 
 def _angles(poses: Poses) -> FloatArray:
-    """The angles (B, B), radians, between poses."""
+    """Return the angles (B, B), radians, between poses."""
     return rotation_angle(product(poses.rotations[:, None], np.swapaxes(poses.rotations, 1, 2)))
 
 
 def _largest_turn(poses: Poses, apart: FloatArray, parts: list[IntArray]) -> tuple[float, float]:
-    """Angle (radians) and distance (m) between the best of the two modes that differ most."""
+    """Return the angle (radians) and distance (m) of the two modes that differ most."""
     firsts = [int(part[0]) for part in parts]
     angles = _angles(poses[np.array(firsts)])
     one, other = np.unravel_index(int(np.argmax(angles)), angles.shape)
@@ -234,7 +236,7 @@ def _largest_turn(poses: Poses, apart: FloatArray, parts: list[IntArray]) -> tup
 
 
 def check_trust(trust: Trust, sensor_noise: float = SENSOR_NOISE) -> list[PointsWarning]:
-    """A warning if no hypothesis explains the points, or not with the sensor's noise, metres.
+    """Return a warning if no hypothesis explains the points, or only with more noise.
 
     The texts have no measured numbers, so that Python shows repeated ones once.
     """
@@ -255,7 +257,7 @@ def check_trust(trust: Trust, sensor_noise: float = SENSOR_NOISE) -> list[Points
 
 
 def correlation(points: FloatArray, errors: FloatArray) -> float:
-    """How alike the errors (N,) of points (N, 3) are to those of their nearest neighbours.
+    """Return the correlation of errors (N,) of points (N, 3) with those of nearest neighbours.
 
     Moran's I about 0, at most 1: near 0 for noise, and near 1 for a wrong shape, whose errors are
     those of whole sides. 0 for few points.
@@ -268,24 +270,24 @@ def correlation(points: FloatArray, errors: FloatArray) -> float:
     squared = away[..., 0] ** 2 + away[..., 1] ** 2 + away[..., 2] ** 2
     np.fill_diagonal(squared, np.inf)
     near = np.argsort(squared, axis=1, kind="stable")[:, :_NEIGHBOURS]
-    own = math.fsum((errors**2).tolist())
-    shared = math.fsum((errors[:, None] * errors[near]).ravel().tolist())
-    return shared / (_NEIGHBOURS * own) if own > 0.0 else 0.0
+    squares = math.fsum((errors**2).tolist())
+    products = math.fsum((errors[:, None] * errors[near]).ravel().tolist())
+    return products / (_NEIGHBOURS * squares) if squares > 0.0 else 0.0
 
 
 def has_pose(hypotheses: Hypotheses) -> bool:
-    """Whether the best hypothesis is a pose that can be judged: there, and within FARTHEST."""
+    """Return whether the best hypothesis can be judged: it is there, and within FARTHEST."""
     poses = Poses.of(hypotheses.object_from_world[:1])
     return len(poses) > 0 and bool(_within(poses).all())
 
 
 def _within(poses: Poses) -> BoolArray:
-    """Which poses (B,) have no number that is NaN or larger than kernels can read."""
+    """Return flags (B,) of poses without a number that is NaN or larger than kernels can read."""
     return np.asarray((np.abs(poses.numbers) <= FARTHEST).all(axis=1))
 
 
 def _compared(hypotheses: Hypotheses) -> tuple[Poses, IntArray]:
-    """The best hypotheses that repeat no other, and their indices."""
+    """Return the best hypotheses that repeat no other, and their indices."""
     if not has_pose(hypotheses):
         raise PoseError(
             "there is no hypothesis, or the best is not finite; accepted: at least one pose, "
@@ -301,7 +303,7 @@ def _compared(hypotheses: Hypotheses) -> tuple[Poses, IntArray]:
 def _mean_error(
     problem: RegistrationProblem, pose: Poses, sensor_noise: float, most: float
 ) -> float:
-    """Average error of a pose, metres, of known points, and of all others that contradict it.
+    """Return the mean error of a pose, metres, of known points and others that contradict it.
 
     most: that a known point counts for. A free point contradicts a pose if it is deeper in the
     object than a voxel and noise explain, an occupied one if it is as far outside; it counts with
@@ -318,27 +320,13 @@ def _mean_error(
     return float(in_order(every)) / max(len(every), 1)
 
 
-def _components(adjacent: BoolArray) -> tuple[int, IntArray]:
-    """How many parts a symmetric graph (K, K) has, and the part of each of its nodes (K,)."""
-    count, part = 0, np.full(len(adjacent), -1)
-    for first in range(len(adjacent)):
-        if part[first] >= 0:
-            continue
-        reached = np.zeros(len(adjacent), dtype=np.bool_)
-        newest = np.arange(len(adjacent)) == first
-        while newest.any():
-            reached |= newest
-            newest = adjacent[newest].any(axis=0) & ~reached
-        part[reached], count = count, count + 1
-    return count, part
-
-
 def motion_cost(
     problem: RegistrationProblem, pose: Poses, sensor_noise: float, distance: float
 ) -> float:
-    """How much less likely the points are if the object's surface moves by a distance, metres.
+    """Return the rise of the energy, nats, if the object's surface moves by a distance, metres.
 
-    In nats, of the likeliest such motion; infinite if there is none. Up to LIMIT they stay likely.
+    It is that of the likeliest such motion, infinite if there is none. Up to LIMIT the points stay
+    likely.
     A set of hypotheses may leave out what its method has not found. So the best pose is moved along
     the motions that contacts resist the least for how far they move the surface: the largest
     solutions of M v = lambda A v, with the mean squares v^T A v by which contacts leave the surface
@@ -356,12 +344,12 @@ def motion_cost(
 
 
 def _loosest_motions(problem: RegistrationProblem, pose: Poses) -> FloatArray:
-    """Twists (K, 6) as `_moved` takes them, K at most 6, by which the surface moves by 1."""
+    """Return twists (K, 6) as `_moved` takes them, K at most 6, by which the surface moves by 1."""
     sdf, step = problem.sdf, 0.5 * problem.sdf.resolution
     nearby = _moved(problem, pose, step * np.concatenate([np.eye(6), -np.eye(6)]))
 
     def products(points: FloatArray) -> FloatArray:
-        """Mean products (6, 6) of the rates at which distances of world points change."""
+        """Return mean products (6, 6) of the rates at which distances of world points change."""
         distances = signed_distances(sdf, nearby, points)  # (12, N)
         rates = (distances[:6] - distances[6:]) / (2.0 * step)
         return in_order(rates[:, None] * rates) / max(len(points), 1)
@@ -377,23 +365,23 @@ def _loosest_motions(problem: RegistrationProblem, pose: Poses) -> FloatArray:
 
 
 def _orthonormal(vectors: FloatArray, metric: FloatArray) -> FloatArray:
-    """Vectors (K, 6) of length 1 by a metric (6, 6), each without its part along those before it.
+    """Return vectors (K, 6) of length 1 by a metric (6, 6), orthogonal to those before.
 
     Vectors of next to no length are left out, such as turns that are symmetries of the object.
     """
-    found: list[FloatArray] = []
+    result: list[FloatArray] = []
     for vector in vectors:
         size = float(np.abs(vector).max())
-        for other in found:
+        for other in result:
             vector = vector - in_order(in_order(metric * other) * vector) * other
         length = math.sqrt(max(float(in_order(in_order(metric * vector) * vector)), 0.0))
         if length > _LEAST_LENGTH * size:
-            found.append(vector / length)
-    return np.array(found).reshape(-1, 6)
+            result.append(vector / length)
+    return np.array(result).reshape(-1, 6)
 
 
 def _moved(problem: RegistrationProblem, pose: Poses, twists: FloatArray) -> Poses:
-    """A pose after motions (K, 6) of the object: shifts, and turns about its middle, metres.
+    """Return a pose after motions (K, 6) of the object: shifts, and turns about its middle, metres.
 
     Turns are lengths of arc at half a diameter.
     """
@@ -405,9 +393,9 @@ def _moved(problem: RegistrationProblem, pose: Poses, twists: FloatArray) -> Pos
 
 
 def pose_energies(problem: RegistrationProblem, poses: Poses, noise: NoiseModel) -> FloatArray:
-    """Minus the log-likelihood (B,) of the points in poses, nats, see `chsel.problem.noise`.
+    """Return minus the log-likelihood (B,) of the points in poses, nats, see `chsel.problem.noise`.
 
-    Of many points by some; those left out count for nothing.
+    Some of many points represent all; those left out count for nothing.
     """
     points, sdf = problem.points, problem.sdf
     known = evenly_spaced(len(points.known), _MOST_KNOWN)
@@ -420,7 +408,7 @@ def pose_energies(problem: RegistrationProblem, poses: Poses, noise: NoiseModel)
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solutions x (K, 6) of matrix x = right (K, 6), positive definite, by elimination."""
+    """Return solutions x (K, 6) of matrix x = right (K, 6), positive definite, by elimination."""
     rows = np.concatenate([matrix, right.T], axis=1)  # (6, 6 + K)
     for i in range(6):
         rows[i] = rows[i] / rows[i, i]

@@ -27,10 +27,10 @@ class SearchObjective(Protocol):
     space_arrays: Any  # of the space, as the kernels take them
 
     def work(self) -> Any:
-        """Scratch for one thread."""
+        """Return scratch for one thread."""
 
     def costs(self, vectors: FloatArray) -> FloatArray:
-        """Costs (B,) of vectors (B, d)."""
+        """Return costs (B,) of vectors (B, d)."""
 
 
 class Evaluated(NamedTuple):
@@ -44,7 +44,7 @@ class Evaluated(NamedTuple):
 def evaluated(
     objective: SearchObjective, measure: Measure, vectors: FloatArray, costs: Any = None
 ) -> Evaluated:
-    """Vectors (B, d) with their measures, and their costs (B,) unless these are known already."""
+    """Return vectors (B, d) with their measures, and their costs (B,) unless known already."""
     costs = objective.costs(vectors) if costs is None else costs
     return Evaluated(vectors, costs, measure.values(objective.space, vectors))
 
@@ -74,7 +74,7 @@ class Batch(NamedTuple):
 
 
 def batch_of(count: int, dimension: int, measures: int) -> Batch:
-    """An empty batch of `count` solutions of `dimension` numbers."""
+    """Return an empty batch of `count` solutions of `dimension` numbers."""
     return Batch(
         vectors=np.zeros((count, dimension)),
         objectives=np.full(count, -np.inf),
@@ -88,7 +88,7 @@ def batch_of(count: int, dimension: int, measures: int) -> Batch:
 
 @inner
 def cell_for(archive: Cells, objective: float, vector: FloatArray, measures: FloatArray) -> int:
-    """The cell of a solution, the nearest one for measures (k,) out of range; -1 if not finite."""
+    """Return the cell of a solution, the nearest one for measures (k,) out of range; -1 if NaN."""
     if not (np.isfinite(objective) and all_finite(measures) and all_finite(vector)):
         return -1
     lower, upper, bins, cell = archive.lower, archive.upper, archive.bins, 0
@@ -154,18 +154,18 @@ def rank(status: IntArray, value: FloatArray, order: IntArray) -> int:
     gap = count // 2  # Shell's sort; the order is total, so that all algorithms give the same
     while gap > 0:
         for i in range(gap, count):
-            item, place = order[i], i
-            while place >= gap and _precedes(status, value, item, order[place - gap]):
-                order[place] = order[place - gap]
-                place -= gap
-            order[place] = item
+            item, at = order[i], i
+            while at >= gap and _precedes(status, value, item, order[at - gap]):
+                order[at] = order[at - gap]
+                at -= gap
+            order[at] = item
         gap //= 2
     return improved
 
 
 @inner
 def sampled_cell(objectives: FloatArray, uniform: float) -> int:
-    """An occupied cell of objectives (cells,), chosen by a number from [0, 1); -1 if none is."""
+    """Return an occupied cell of objectives (cells,) by a number from [0, 1); -1 if none is."""
     occupied = 0
     for objective in objectives:
         occupied += int(objective > -np.inf)
@@ -244,7 +244,7 @@ class GridArchive:
         return self.cells.solutions[int(np.argmax(self.cells.objectives))]
 
     def snapshot(self, iteration: int, refinement: int) -> ArchiveSnapshot:
-        """A copy of the occupied cells."""
+        """Return a copy of the occupied cells."""
         cells = self.occupied
         return ArchiveSnapshot(
             iteration=iteration,

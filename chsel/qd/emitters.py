@@ -61,10 +61,10 @@ class EmitterSettings(CheckedSettings):
 
 
 class Landscape(NamedTuple):
-    """What search vectors are evaluated by, see SearchObjective."""
+    """Data that search vectors are evaluated by, see SearchObjective."""
 
-    model: Any
-    space: Any
+    model: Any  # of the cost
+    space: Any  # of the vectors
     measure: Any  # MeasureCode
     work: Any  # scratch
 
@@ -72,8 +72,8 @@ class Landscape(NamedTuple):
 class Adam(NamedTuple):
     """State of Adam, see adam_step."""
 
-    rate: float
-    epsilon: float
+    rate: float  # step size
+    epsilon: float  # added to the root of the second moment
     moments: FloatArray  # (2, d)
     powers: FloatArray  # (2,), of the two betas
 
@@ -87,21 +87,21 @@ class MegaSearch(NamedTuple):
     measure_gradients: FloatArray  # (k, d), at theta
     directions: FloatArray  # (k + 1, d), normalised gradients, that of the objective first
     coefficients: FloatArray  # (L, k + 1), of the directions, which the strategy adapts
-    branches: Batch
-    strategy: Strategy
+    branches: Batch  # of an iteration
+    strategy: Strategy  # of the coefficients
     adam: Adam  # moves theta
 
 
 class MeSearch(NamedTuple):
     """State of CMA-ME: the strategy adapts the search vectors themselves."""
 
-    samples: Batch
-    strategy: Strategy
+    samples: Batch  # of an iteration
+    strategy: Strategy  # of the samples
 
 
 @compiled
 def mega_iterations(landscape, archive, search, normals, elites, first, last):
-    """Iterations of CMA-MEGA (Fontaine and Nikolaidis, 2021) from `first` to before `last`.
+    """Run iterations of CMA-MEGA (Fontaine and Nikolaidis, 2021) from `first` to before `last`.
 
     normals: (iterations, L, n) for the strategy. elites: (iterations,) in [0, 1), each of which
     chooses an elite for a restart.
@@ -137,7 +137,7 @@ def mega_iterations(landscape, archive, search, normals, elites, first, last):
 
 @compiled
 def me_iterations(landscape, archive, search, normals, elites, first, last):
-    """The same of CMA-ME (Fontaine et al., 2020)."""
+    """Run iterations of CMA-ME (Fontaine et al., 2020) from `first` to before `last`."""
     samples, strategy = search.samples, search.strategy
     for iteration in range(first, last):
         ask(strategy, normals[iteration], samples.vectors)
@@ -196,7 +196,7 @@ def _move_to_elite(archive: Cells, uniform: float, vector: FloatArray) -> None:
 
 @inner
 def _move_towards(theta, branches, weights, parents, adam):
-    """One step of Adam from theta to the weighted mean of the best branches, its parents."""
+    """Move theta by a step of Adam to the weighted mean of the best branches, its parents."""
     vectors, order = branches.vectors, branches.order
     moments, powers = adam.moments, adam.powers
     powers[0] *= BETA1
@@ -215,7 +215,7 @@ def mega_search(
     settings: EmitterSettings,
     epsilon: float = EPSILON,
 ) -> MegaSearch:
-    """CMA-MEGA at theta = start (d,), with so many measures and branches; epsilon is Adam's."""
+    """Return CMA-MEGA at theta = start (d,), of so many measures and branches; Adam's epsilon."""
     d, n, parity = len(start), measures + 1, settings.ribs_parity
     return MegaSearch(
         theta=np.array(start, dtype=np.float64),
@@ -231,7 +231,7 @@ def mega_search(
 
 
 def me_search(start: FloatArray, measures: int, batch: int, settings: EmitterSettings) -> MeSearch:
-    """CMA-ME around start (d,), with so many measures and samples."""
+    """Return CMA-ME around start (d,), with so many measures and samples."""
     parity = settings.ribs_parity
     strategy = strategy_around(start, batch, settings.sigma0, ribs_parity=parity)
     return MeSearch(batch_of(batch, len(start), measures), strategy)

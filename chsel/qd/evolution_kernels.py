@@ -46,7 +46,7 @@ class Strategy(NamedTuple):
 def strategy_around(
     mean: FloatArray, batch: int, sigma0: float, *, ribs_parity: bool = False
 ) -> Strategy:
-    """A new strategy around `mean` (n,)."""
+    """Return a new strategy around `mean` (n,)."""
     n, ranks = len(mean), np.arange(1.0, batch + 1.0)
     return Strategy(
         batch=batch,
@@ -121,7 +121,7 @@ def _weigh(logarithms: FloatArray, parents: int, weights: FloatArray) -> float:
 
 @inner
 def _learning_rates(n: int, mueff: float) -> tuple[float, float, float, float, float]:
-    """c_c, c_sigma, c_1, c_mu and d_sigma for n dimensions."""
+    """Return c_c, c_sigma, c_1, c_mu and d_sigma for n dimensions."""
     cc = (4.0 + mueff / n) / (n + 4.0 + 2.0 * mueff / n)
     cs = (mueff + 2.0) / (n + mueff + 5.0)
     c1 = 2.0 / ((n + 1.3) * (n + 1.3) + mueff)
@@ -188,7 +188,7 @@ def _whiten(values: FloatArray, vectors: FloatArray, step: FloatArray, out: Floa
 
 @inner
 def _power(base: float, exponent: int) -> float:
-    """base^exponent by repeated squaring."""
+    """Return base^exponent by repeated squaring."""
     result = 1.0
     while exponent > 0:
         if exponent % 2 == 1:
@@ -200,7 +200,7 @@ def _power(base: float, exponent: int) -> float:
 
 @inner
 def _add_rank_one(covariance: FloatArray, kept: float, scale: float, vector: FloatArray) -> None:
-    """C <- kept C + scale v v^T."""
+    """Replace C by kept C + scale v v^T."""
     for j in range(len(vector)):
         for k in range(j + 1):
             entry = kept * covariance[j, k] + scale * (vector[j] * vector[k])
@@ -209,7 +209,7 @@ def _add_rank_one(covariance: FloatArray, kept: float, scale: float, vector: Flo
 
 @inner
 def stopped(strategy: Strategy, order: IntArray, status: IntArray, value: FloatArray) -> bool:
-    """Whether to restart: degenerate covariance, tiny step, or a flat ranking of the batch."""
+    """Return whether to restart: degenerate covariance, tiny step, or a flat ranking."""
     values, last = strategy.eigenvalues, len(order) - 1
     smallest, largest = values[0], values[len(values) - 1]
     if largest / smallest > _MAX_CONDITION:

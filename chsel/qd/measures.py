@@ -20,7 +20,7 @@ VECTOR, TRANSLATION, OBJECT_POSITION, OBJECT_YAW = range(4)
 class MeasureCode(NamedTuple):
     """A measure as kernels take it."""
 
-    kind: int
+    kind: int  # VECTOR, TRANSLATION, ...
     size: int  # k
     first: int = 0  # of kind VECTOR: the first entry of the vector that it takes
 
@@ -96,7 +96,7 @@ class Measure:
     """A map from search vectors to k numbers."""
 
     axes: tuple[str, ...]  # (k,), names with units
-    code: MeasureCode
+    code: MeasureCode  # for kernels
     circular: bool = False  # an angle in radians
 
     @property
@@ -105,19 +105,19 @@ class Measure:
         return len(self.axes)
 
     def values(self, space: SearchSpace, vectors: FloatArray) -> FloatArray:
-        """Measures (B, k) of search vectors (B, d)."""
+        """Return measures (B, k) of search vectors (B, d)."""
         values = np.empty((len(vectors), self.count))
         all_measures(space.arrays, self.code, vectors, values)
         return values
 
     def gradients(self, space: SearchSpace, vector: FloatArray) -> FloatArray:
-        """Gradients (k, d) of the measures at one search vector (d,)."""
+        """Return gradients (k, d) of the measures at one search vector (d,)."""
         gradients = np.empty((self.count, len(vector)))
         measure_gradients(space.arrays, self.code, vector, gradients)
         return gradients
 
     def moments(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean and population standard deviation (k,) of values (B, k), on the circle if circular.
+        """Return mean and population standard deviation (k,) of values (B, k), also on a circle.
 
         The circular deviation is sqrt(-2 ln R), R the length of the mean direction.
         """
@@ -149,7 +149,7 @@ MEASURES = {**_ANY, **_SE3_ONLY, **_SE2_ONLY}
 
 
 def measure_named(name: str, *, planar: bool) -> Measure:
-    """The measure of that name; SettingError if it does not exist in this search space."""
+    """Return the measure of that name; SettingError if it does not exist in this search space."""
     require_choice("measure", name, MEASURES)
     refused, wanted = (_SE3_ONLY, "without plane") if planar else (_SE2_ONLY, "with plane")
     if name in refused:

@@ -1,4 +1,4 @@
-"""Which estimates size the archive, and which elites become hypotheses (Alg. 1, lines 2-4, 7)."""
+"""The estimates that size the archive, and the elites that become hypotheses (Alg. 1)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class ArchiveSettings(CheckedSettings):
     # Which of E' are left out of mean and deviation: "ratio" those above
     # ratio x lowest cost + tolerance, "quantile" those above the 80 % quantile, "none".
     outliers: Annotated[str, one_of("ratio", "quantile", "none")] = "ratio"
-    ratio: Annotated[float, positive] = 5.0
+    ratio: Annotated[float, positive] = 5.0  # of the lowest cost
     tolerance_per_point: Annotated[float, not_negative] = 1e-3  # tolerance per known point
     tolerance: Annotated[float, not_negative] = 1e-6  # its floor
 
@@ -53,7 +53,7 @@ class ArchiveSettings(CheckedSettings):
 
 @dataclass(frozen=True)
 class OutputSettings(CheckedSettings):
-    """How hypotheses are chosen from the archive."""
+    """The choice of hypotheses from the archive."""
 
     # "lowest" for the lowest costs, "representative" for those below the limit that all others
     # below it are near to; it is "lowest" where no more than wanted are below.
@@ -62,10 +62,10 @@ class OutputSettings(CheckedSettings):
     # ratio x lowest cost + tolerance, "noise" for those below the larger of ratio x lowest cost
     # and lowest cost + tolerance_per_point x known points + free_tolerance.
     limit: Annotated[str, one_of("none", "ratio", "noise")] = "noise"
-    ratio: Annotated[float, positive] = 1.3
-    tolerance: Annotated[float, not_negative] = 1e-6
-    tolerance_per_point: Annotated[float, not_negative] = 5e-4
-    free_tolerance: Annotated[float, not_negative] = 0.01
+    ratio: Annotated[float, positive] = 1.3  # of the lowest cost
+    tolerance: Annotated[float, not_negative] = 1e-6  # of "ratio"
+    tolerance_per_point: Annotated[float, not_negative] = 5e-4  # of "noise"
+    free_tolerance: Annotated[float, not_negative] = 0.01  # of "noise"
     # What fills a set of too few: "next_best" the next cells, then copies; "resample" copies drawn
     # with replacement; "fewer" nothing.
     shortage: Annotated[str, one_of("next_best", "resample", "fewer")] = "next_best"
@@ -93,9 +93,9 @@ def sized_archive(
     known_count: int,
     dimension: int,
 ) -> GridArchive:
-    """An empty archive of vectors (d,) with the range mean +- b_sigma standard deviations (k,).
+    """Return an empty archive of vectors (d,), mean +- b_sigma standard deviations (k,) wide.
 
-    Of the measures of estimates E' that are no outliers, by the number of known points.
+    Mean and deviations are those of the measures of estimates E' that are no outliers.
     """
     kept = estimates.measures[_inliers(estimates.costs, settings, known_count)]
     mean, deviation = measure.moments(kept if len(kept) >= 2 else estimates.measures)
@@ -122,7 +122,7 @@ def select_elites(
     settings: OutputSettings,
     stream: np.random.Generator,
 ) -> IntArray:
-    """Indices of as many of C elites with costs (C,) as E_0 has, or fewer if so set, best first."""
+    """Return indices of as many of C elites with costs (C,) as E_0 has, or as set; best first."""
     count, known_count = len(problem.initial_set), len(problem.points.known)
     order = np.argsort(costs, kind="stable")
     order = order[within_workspace(elites, problem, space, settings.margin)[order]]
@@ -145,7 +145,7 @@ def select_elites(
 def within_workspace(
     poses: Poses, problem: RegistrationProblem, space: SearchSpace, margin: float | None
 ) -> BoolArray:
-    """True (B,) where the object's origin is in the workspace, widened by a margin in metres.
+    """Return True (B,) where the object's origin is in the workspace, widened by a margin (m).
 
     All True without a margin, or if there is no such pose.
     """
@@ -168,7 +168,7 @@ def _limit(costs: FloatArray, settings: OutputSettings, known_count: int) -> flo
 
 
 def repeated(poses: Poses) -> BoolArray:
-    """True (B,) for each pose that equals an earlier one."""
+    """Return True (B,) for each pose that equals an earlier one."""
     first: dict[tuple[float, ...], int] = {}
     rows = enumerate(map(tuple, poses.numbers.tolist()))
     return np.array([first.setdefault(row, n) < n for n, row in rows], dtype=bool)
@@ -181,7 +181,7 @@ def ranked_hypotheses(
     elites: Poses | None = None,
     archive: ArchiveSnapshot | None = None,
 ) -> Hypotheses:
-    """Poses in order of their costs, which are computed; otherwise as `ranked`."""
+    """Return poses in order of their costs, which are computed; otherwise as `ranked`."""
     cost = objective.costs(objective.space.encode(poses))
     kept = None if elites is None else elites.matrices
     return ranked(poses.matrices, cost, cells, kept, archive)
@@ -194,7 +194,7 @@ def ranked(
     elites: FloatArray | None = None,
     archive: ArchiveSnapshot | None = None,
 ) -> Hypotheses:
-    """Poses (B, 4, 4) in order of their costs (B,).
+    """Return poses (B, 4, 4) in order of their costs (B,).
 
     cells (B,): of the archive that they come from, by default none. elites (L, 4, 4): all
     solutions kept, by default the poses in their order. Raises ChselError if no cost is finite.

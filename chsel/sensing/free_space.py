@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from chsel.errors import PointsError, PoseError, SettingError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, frozen
+from chsel.numerics.cell_set import voxel_of
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import moved, pose_at
 from chsel.numerics.threads import parallel_for
@@ -223,9 +224,7 @@ def mark_points(grid, points, moves, first, last):
     for n in range(first, last):
         for p in range(len(moves)):
             x, y, z = moved(pose_at(moves, p), points[n, 0], points[n, 1], points[n, 2])
-            i = np.rint((x - lower[0]) / spacing)
-            j = np.rint((y - lower[1]) / spacing)
-            k = np.rint((z - lower[2]) / spacing)
+            i, j, k = voxel_of(lower, spacing, x, y, z)
             if 0.0 <= i < nx and 0.0 <= j < ny and 0.0 <= k < nz:
                 grid.marks[(int(i) * ny + int(j)) * nz + int(k)] = 1
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
+from chsel.methods.anchored.anchored import Anchored
+from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.methods.anchored.pose_bound import pose_bound
 from chsel.methods.method import Method
 from chsel.problem.pushes import Pushes

@@ -16,8 +16,8 @@ from chsel.next_probe.forecast import BeliefSettings, belief_after, belief_befor
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.policies.policy import Policy
 from chsel.problem.initial_sets import OnlineSettings, posed_problem
-from chsel.problem.points import KnownPoints, Workspace, require_parts
-from chsel.problem.pushes import CLASSES, Pushes
+from chsel.problem.points import POINT_CLASSES, KnownPoints, Workspace, require_parts
+from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
@@ -160,7 +160,7 @@ class Loop:
         points = state.points.merged(probe.new_points)
         pushes = state.pushes
         if probe.push is not None:
-            before = tuple(len(getattr(points, name)) for name in CLASSES)
+            before = tuple(len(getattr(points, name)) for name in POINT_CLASSES)
             pushes = (*pushes, Push(probe.push, before))
         self.state = replace(
             state,

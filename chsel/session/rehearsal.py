@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from chsel.events import Probe
-from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
+from chsel.methods.anchored.anchored import Anchored
+from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.methods.method import Method
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.compiler import cache_directory

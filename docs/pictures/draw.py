@@ -20,7 +20,9 @@ from PIL import Image
 from scipy.ndimage import binary_closing, binary_fill_holes, gaussian_filter
 
 from chsel.methods.anchor_sampling import AnchorSampler, most_informative_first
-from chsel.methods.anchored.anchored import EFFORTS, Anchored, AnchoredSettings, Search
+from chsel.methods.anchored.anchored import Anchored
+from chsel.methods.anchored.anchored_settings import EFFORTS, AnchoredSettings
+from chsel.methods.anchored.search import Search
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.surface_distance import SurfaceDistance, surface_points
 from chsel.problem.noise import FOREIGN

@@ -10,7 +10,7 @@ import numpy as np
 from chsel.errors import RecordingError
 from chsel.events import Event, HypothesesFound, Logged, Probe, SessionStarted, SnapshotTaken
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.points import KnownPoints
+from chsel.problem.points import POINT_CLASSES, KnownPoints
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
 from replay.mcap.attachments import mesh_attached, sdf_attached
 from replay.mcap.encoding import check_message, decode, message_class, parsed, shared_arguments
@@ -44,7 +44,7 @@ class EventReader:
         self._sdf_digest = ""
         self._opening: dict[str, Any] = {}
         self._clouds: dict[str, FloatArray] = {}
-        self._counts: dict[str, int] | None = {"free": 0, "occupied": 0, "known": 0}
+        self._counts: dict[str, int] | None = dict.fromkeys(POINT_CLASSES, 0)
         self._last_snapshot: ArchiveSnapshot | None = None
         self._last_elites: FloatArray | None = None
 
@@ -116,7 +116,7 @@ class EventReader:
         }
         free, occupied, known = clouds.values()
         points = KnownPoints(free, occupied, known[:, :3], known[:, 3])
-        counts = {name: len(getattr(points, name)) for name in ("free", "occupied", "known")}
+        counts = {name: len(getattr(points, name)) for name in POINT_CLASSES}
         before = self._counts or {name: values[name] - counts[name] for name in counts}
         self._counts = {name: before[name] + count for name, count in counts.items()}
         for name, count in counts.items():

@@ -18,11 +18,11 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from chsel.errors import RecordingError
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import POINT_CLASSES
 from replay.mcap.encoding import parsed
 from replay.mcap.schemas import PACKAGE, RECORDS
 from replay.mcap.texts import check_text
 
-POINT_CLASSES = ("free", "occupied", "known")
 LEVELS = 4
 """Clouds of all points so far of each class, see `viewer_messages.CumulativePoints`."""
 

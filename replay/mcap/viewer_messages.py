@@ -26,14 +26,13 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 
 from chsel.events import Believed, Decided, Event, HypothesesFound, Probe, SessionStarted
 from chsel.numerics.arrays import FloatArray, IntArray
-from chsel.problem.points import KnownPoints
+from chsel.problem.points import POINT_CLASSES, KnownPoints
 from chsel.problem.poses import compose, inverse, quaternions
 from chsel.problem.registration_problem import Hypotheses
 from replay.colors import CONTACT, FREE, OCCUPIED, SERIES, ColorArray, cost_colors
 from replay.colors import OBJECT as OBJECT_COLOR
 from replay.mcap.foxglove_messages import (
     LEVELS,
-    POINT_CLASSES,
     UNMOVED,
     VIEWS,
     WORLD,

@@ -28,7 +28,7 @@ from chsel.events import (
 )
 from chsel.next_probe.decision_problem import DecisionProblem
 from chsel.numerics.arrays import FloatArray, digest
-from chsel.problem.points import KnownPoints
+from chsel.problem.points import POINT_CLASSES, KnownPoints
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.files import sync_folder
 from replay.mcap.attachments import MEDIA_TYPES, mesh_to_ply, sdf_to_bytes
@@ -40,7 +40,7 @@ from replay.mcap.encoding import (
     shared_values,
 )
 from replay.mcap.event_messages import archive_values, event_values
-from replay.mcap.foxglove_messages import CLOUDS, FOXGLOVE, POINT_CLASSES, log_line, point_cloud
+from replay.mcap.foxglove_messages import CLOUDS, FOXGLOVE, log_line, point_cloud
 from replay.mcap.schemas import BEFORE_ALL_STEPS, MESH, PROFILE, RECORDS, SDF_GRID, STEP_TIME
 from replay.mcap.validation import EventOrder
 from replay.mcap.viewer_messages import STARTING_EMPTY, Views, empty_cloud

@@ -23,6 +23,7 @@ from chsel.errors import RecordingError, SettingError
 from chsel.events import Believed, SensorImage
 from chsel.next_probe.decision_problem import Actions
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import POINT_CLASSES
 from chsel.problem.poses import inverse, quaternions
 from chsel.problem.registration_problem import ArchiveSnapshot
 from replay.arguments import STEPS_HELP, chosen_steps, path_argument
@@ -30,7 +31,6 @@ from replay.comparing.beliefs import BeliefSequence
 from replay.console import Console
 from replay.files import new_file
 from replay.mcap.event_messages import step_numbers
-from replay.mcap.foxglove_messages import POINT_CLASSES
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.schemas import NUMBERS
 from replay.verbs.info import step_rows

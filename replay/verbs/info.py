@@ -24,6 +24,7 @@ from rich.table import Table
 from chsel.errors import RecordingError, SessionError
 from chsel.events import Decided, Probe
 from chsel.problem.mesh import mesh_digest
+from chsel.problem.points import POINT_CLASSES
 from replay.console import Console, plain_table, print_error
 from replay.mcap.file import MALFORMED, McapFile, recover_hint
 from replay.mcap.foxglove_messages import TOPIC_SCHEMAS
@@ -31,7 +32,7 @@ from replay.mcap.log_file import OTHER_LOGS, ROS1_BAG, Channel, RawFile
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.schemas import FORMAT_VERSION, PROFILE
 
-_POINTS = ("free", "occupied", "known", "contacts")
+_POINTS = (*POINT_CLASSES, "contacts")
 _SECOND = 10**9
 _LONGEST_HEADER = 4096  # bytes
 

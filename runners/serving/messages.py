@@ -16,7 +16,7 @@ import numpy as np
 from chsel.errors import PointsError, SettingError, quoted, require_choice
 from chsel.next_probe.decision_problem import Actions
 from chsel.problem.mesh import clean_mesh, load_mesh
-from chsel.problem.points import FREE_RESOLUTION, Workspace
+from chsel.problem.points import FREE_RESOLUTION, POINT_CLASSES, Workspace
 from chsel.problem.poses import inverse
 from chsel.problem.settings import CheckedSettings, build_settings, not_negative, positive
 from chsel.session.session import Session
@@ -83,7 +83,7 @@ def add(session: Session, values: Json) -> Json:
     arrays = _arrays(values)
     session.add(**arrays, hand=None if hand is None else _mesh("hand", hand))
     points = session.points
-    counts = {name: len(getattr(points, name)) for name in ("known", "free", "occupied")}
+    counts = {name: len(getattr(points, name)) for name in POINT_CLASSES}
     return {"step": session.step, "points": counts, "warnings": _warnings(session)}
 
 

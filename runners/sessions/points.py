@@ -24,6 +24,7 @@ from chsel.events import Probe
 from chsel.numerics.arrays import FloatArray, IntArray, frozen, read_npz, refuse_special_file
 from chsel.problem.points import (
     FREE_RESOLUTION,
+    POINT_CLASSES,
     KnownPoints,
     Workspace,
     check_places,
@@ -114,7 +115,7 @@ class PointsSession:
         """Nothing is held open."""
 
 
-KINDS = ("surface", "free", "occupied", "known")
+KINDS = ("surface", *POINT_CLASSES)
 _COLUMNS = ["x", "y", "z", "kind", "sdf", "step"]
 _ACCEPTED = "x, y, z[, kind[, sdf]][, step], commas between them, decimal points in numbers"
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from scipy.stats import norm
 
 import chsel
 from chsel.belief import Gripper, PoseBelief, wilson
@@ -136,7 +137,7 @@ def test_grasps_of_boxes_are_right_by_intervals():
 
 
 def test_an_interval_is_wilsons():
-    share, count, normal = np.array([0.8, 0.3, 0.0]), 30, 1.6449
+    share, count, normal = np.array([0.8, 0.3, 0.0]), 30, norm.ppf(0.95)
     for end in wilson(share, count)[1:]:  # where the share is as many deviations away
         away = (share - end) ** 2
         np.testing.assert_allclose(away, normal**2 * end * (1.0 - end) / count, atol=1e-12)

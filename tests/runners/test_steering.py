@@ -5,11 +5,12 @@ import re
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from chsel.errors import SettingError
 from chsel.events import Believed, Decided, Measured, Probe
-from chsel.policies.steering import Steering
 from chsel.problem.registration_problem import VERDICTS
+from chsel.session.loop import Loop
 from replay.comparing.verification import EQUAL, verify
 from replay.mcap.reader import read_recording
 from runners import probe
@@ -99,7 +100,7 @@ def test_a_session_ends_with_a_sure_grasp_and_says_how_sure_it_is_of_each_mode(t
     assert last["grasp_chance"] == 1.0
     # Wilson's interval of n successes in n trials is from n / (n + z^2) to 1.
     lower, upper = last["grasp_chance_interval"]
-    trials = lower / (1.0 - lower) * 1.6449**2
+    trials = lower / (1.0 - lower) * norm.ppf(0.95) ** 2
     assert (trials, upper) == pytest.approx((round(trials), 1.0))
     assert 1 < trials < 31
     assert last["action"] == decided(recording)[-1].decision.chosen
@@ -138,12 +139,12 @@ def test_a_mistake_in_a_file_of_grasps_is_one_line(arrays, message, tmp_path):
 
 
 def test_a_surprise_starts_the_next_registration_afresh(tmp_path, monkeypatch):
-    felt = Steering.felt
+    surprised = Loop._is_surprised.fget
 
-    def surprised(steering, contacts):
-        return felt(steering, contacts) or steering.last.problem.key.step == 2
+    def or_at_the_third(loop):
+        return surprised(loop) or loop.state.step == 2
 
-    monkeypatch.setattr(Steering, "felt", surprised)
+    monkeypatch.setattr(Loop, "_is_surprised", property(or_at_the_third))
     _, recording, _ = steered(tmp_path, "policy=information", "policy.probes=4")
     sizes = [len(recording.problem(step).initial_set) for step in recording.steps]
     assert dict(zip(recording.steps, sizes, strict=True))[2] == 90

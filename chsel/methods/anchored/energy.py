@@ -23,12 +23,13 @@ from chsel.problem.noise import EXTENT, LATER, SHARE, NoiseModel
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
-from chsel.problem.sdf_lookup import distance_at, value_between_nodes
+from chsel.problem.sdf_lookup import cell_of, distance_at, value_between_nodes
 
+# Where these numbers are from: docs/anchored.md, "Numbers that are no settings".
 _ROWS_PER_LEVEL = 4.0  # of tables, in the least s_k
 _BEYOND = 6.0  # of the greatest s_k: residuals beyond cost no more
-_AT_ONCE = 16  # known points between two looks at the limit
-_LEVELS = 8  # K, here because kernels take constants from kernel files alone
+_AT_ONCE = 16  # known points between two comparisons with the limit
+_LEVELS = 8  # K of the likelihood, as kernels take constants from kernel files alone
 _LOG_LEVELS = 2.0794415416798357  # ln K
 _ALL = -1  # instead of the number of packets that were gathered
 
@@ -49,7 +50,7 @@ class Likelihood(NamedTuple):
 
 
 def likelihood_of(noise: NoiseModel, known: int) -> Likelihood:
-    """Tables for so many known points."""
+    """Return tables for so many known points."""
     step = noise.sigmas[0] / _ROWS_PER_LEVEL
     rows = int(_BEYOND * noise.sigmas[-1] / step) + 2
     sizes, sigmas = step * np.arange(rows, dtype=np.float64), np.array(noise.sigmas)
@@ -72,7 +73,7 @@ def likelihood_of(noise: NoiseModel, known: int) -> Likelihood:
 
 
 class Scratch(NamedTuple):
-    """Of one thread."""
+    """Scratch arrays of one thread."""
 
     near: NearPoints  # the free points gathered
     memory: FloatArray  # (12,), where the object was then, see remember and travel
@@ -94,18 +95,18 @@ class Energy:
         self.likelihood = likelihood_of(noise, self._count)
 
     def by(self, noise: NoiseModel) -> Energy:
-        """The energy by another noise model."""
+        """Return the energy by another noise model."""
         other = copy(self)
         other._set(noise)
         return other
 
     def scratch(self) -> Scratch:
-        """Scratch of one thread."""
+        """Return scratch of one thread."""
         near = near_points_for(self.model.free.tree, 1)
         return Scratch(near, scratch(12), scratch(_LEVELS))
 
     def of(self, poses: Poses) -> FloatArray:
-        """Energies (B,) of poses."""
+        """Return energies (B,) of poses."""
         energies = np.empty(len(poses))
 
         def run(first: int, last: int, work: Any) -> None:
@@ -127,7 +128,7 @@ def energies_of(model, likelihood, poses, out, first, last, work):
 
 @leaf
 def known_energy(model, likelihood, pose, limit, sums):
-    """The energy of known points; infinite if it is surely above a limit.
+    """Return the energy of known points; infinite if it is surely above a limit.
 
     sums (K,) become the posterior weights of the levels.
     """
@@ -161,7 +162,7 @@ def known_energy(model, likelihood, pose, limit, sums):
 
 @leaf
 def _row(likelihood, residual):
-    """Where the row of a residual begins in tables, and the part of the step beyond it."""
+    """Return the index of a residual's row in tables, and its fraction of the step beyond."""
     size = max(abs(residual) - likelihood.shared, 0.0)
     row = min(size * likelihood.per_metre, likelihood.last)
     at = np.uint64(row)
@@ -170,7 +171,7 @@ def _row(likelihood, residual):
 
 @leaf
 def known_slope(likelihood, residual, weights):
-    """The derivative of the energy by half of a squared residual; weights: of the levels."""
+    """Return the derivative of the energy by half of a squared residual; weights: of the levels."""
     at, part = _row(likelihood, residual)
     slopes, levels, total = likelihood.slopes, np.uint64(_LEVELS), 0.0
     for k in range(levels):
@@ -181,21 +182,21 @@ def known_slope(likelihood, residual, weights):
 
 @leaf
 def _depth_cost(likelihood, depth):
-    """What a free or occupied point costs that is so deep on the wrong side, metres."""
+    """Return the cost of a free or occupied point so deep on the wrong side, metres."""
     ratio = depth / likelihood.softness
     return min(0.5 * ratio * ratio, likelihood.wrong)
 
 
 @leaf
-def _of_depths(likelihood, costs):
-    """The energy of all points on the wrong side, whose costs have this sum."""
+def _depth_energy(likelihood, costs):
+    """Return the energy of all points on the wrong side, whose costs have this sum."""
     beyond = likelihood.later * (costs - likelihood.wrong)
     return likelihood.power * min(costs, likelihood.wrong + beyond)
 
 
 @leaf
 def depth_slope(likelihood, depth, costs):
-    """The derivative of _of_depths by half of one squared depth."""
+    """Return the derivative of _depth_energy by half of one squared depth."""
     ratio, softness = depth / likelihood.softness, likelihood.softness
     if 0.5 * ratio * ratio >= likelihood.wrong:
         return 0.0
@@ -205,24 +206,24 @@ def depth_slope(likelihood, depth, costs):
 
 @leaf
 def energy_below(model, likelihood, pose, known, limit, work):
-    """An energy of known points plus that of occupied and of gathered free ones.
+    """Return an energy of known points plus that of occupied and of gathered free ones.
 
-    Infinite above a limit. Also the sum of the costs of the latter.
+    It is infinite above a limit. Also return the sum of the costs of the latter.
     """
     occupied, table, costs = model.occupied, model.field.table, 0.0
     for n in range(occupied.shape[1]):
         s = distance_at(model.field, pose, occupied[0, n], occupied[1, n], occupied[2, n])
         costs += _depth_cost(likelihood, max(s + model.alpha, 0.0))
     across, along = np.int64(model.field.box.across), np.int64(model.field.box.along)
-    total = known + _of_depths(likelihood, costs)
+    total = known + _depth_energy(likelihood, costs)
     for n in range(look_around(model, pose, work)):
         if not total <= limit:
             break
-        cell, u, v, w = place_of(model, pose, free_point(model, work, n))
+        cell, u, v, w = free_cell(model, pose, free_point(model, work, n))
         if cell >= 0:
             s = value_between_nodes(table, cell, across, along, u, v, w)
             costs += _depth_cost(likelihood, max(model.alpha - s, 0.0))
-            total = known + _of_depths(likelihood, costs)
+            total = known + _depth_energy(likelihood, costs)
     return total if total <= limit else np.inf, costs
 
 
@@ -244,7 +245,7 @@ def gather_free(model, pose, slack, work):
 
 @leaf
 def look_around(model, pose, work):
-    """Fill hits with those gathered that may cost something at a pose; returns how many."""
+    """Fill hits with those gathered that may cost something at a pose; return their number."""
     free, points = model.free, work.near
     if points.number[0] == 0:
         return 0
@@ -259,23 +260,16 @@ def look_around(model, pose, work):
 
 @leaf
 def free_point(model, work, n):
-    """The n-th of the hits: a point of the world."""
+    """Return the n-th of the hits: a point of the world."""
     at, points = np.uint64(work.near.hits[n]), model.free.tree.points
     return points[0, at], points[1, at], points[2, at]
 
 
 @leaf
-def place_of(model, pose, point):
-    """The lowest node of a world point's cell, -1 where free points cost nothing, and fractions."""
-    box = model.field.box
-    first, last, most, inverse = box.first, box.last, box.most, box.inverse
+def free_cell(model, pose, point):
+    """Return the lowest node of a point's cell, -1 if free points cost nothing, and fractions."""
     x, y, z = moved(pose, point[0], point[1], point[2])
-    a = min(max(first[0], x), last[0])
-    b = min(max(first[1], y), last[1])
-    c = min(max(first[2], z), last[2])
-    u, v, w = (a - first[0]) * inverse, (b - first[1]) * inverse, (c - first[2]) * inverse
-    i, j, k = min(np.floor(u), most[0]), min(np.floor(v), most[1]), min(np.floor(w), most[2])
-    cell = int(i * box.across + j * box.along + k)
-    if a != x or b != y or c != z or model.free.cells.steps[np.uint64(cell)] > 0:
+    (cell, _, _, u, v, w), is_beyond = cell_of(model.field.box, x, y, z)
+    if is_beyond or model.free.cells.steps[np.uint64(cell)] > 0:
         cell = -1
-    return cell, u - i, v - j, w - k
+    return cell, u, v, w

@@ -17,12 +17,12 @@ from chsel.methods.anchored.energy import (
     Scratch,
     depth_slope,
     energy_below,
+    free_cell,
     free_point,
     gather_free,
     known_energy,
     known_slope,
     look_around,
-    place_of,
 )
 from chsel.numerics.arrays import FloatArray, scratch
 from chsel.numerics.cell_set import triple
@@ -33,11 +33,14 @@ from chsel.problem.poses import Poses
 from chsel.problem.sdf_lookup import distance_between_nodes, distance_with_gradient
 from chsel.problem.search_space import SE2Space, SearchSpace
 
+# Where these numbers are from: docs/anchored.md, "Numbers that are no settings".
 _LEVER = 0.15  # metres that a radian counts for
-_MOST_SHIFT, _MOST_TURN = 0.08, 0.5  # of a step, metres and radians
+_MOST_SHIFT = 0.08  # metres of a step
+_MOST_TURN = 0.5  # radians of a step
 _SLACK = 0.02  # metres that a pose may move before free points are gathered again
 _FIRST_DAMPING = 1e-2  # of the mean of the diagonal
-_LESS, _MORE = 0.3, 5.0  # factors of the damping, after a step that was good or bad
+_LESS = 0.3  # factor of the damping after a step that lowered the energy
+_MORE = 5.0  # and after one that did not
 _MOST_DAMPING = 1e6
 _ENOUGH = 1e-4  # relative gain below which a pose has converged
 
@@ -50,7 +53,7 @@ class Twists(NamedTuple):
 
 
 def twists_of(space: SearchSpace, pivot: FloatArray) -> Twists:
-    """All of SE(3) or SE(2), about a point (3,) of the object."""
+    """Return the motions of SE(3) or SE(2), about a point (3,) of the object."""
     basis = np.eye(6)
     if isinstance(space, SE2Space):
         basis = np.zeros((3, 6))
@@ -62,7 +65,7 @@ def twists_of(space: SearchSpace, pivot: FloatArray) -> Twists:
 class Fit(NamedTuple):
     """Scratch of one thread. Only the lower triangles of matrices are used."""
 
-    work: Scratch
+    work: Scratch  # of the energy
     sums: FloatArray  # (8, 6): over residuals, of products of their rates of change by twists, of
     # these rates times the residuals; and the rates of one
     normal: FloatArray  # (d, d), of the normal equations
@@ -73,17 +76,17 @@ class Fit(NamedTuple):
 
 
 def fitted(energy: Energy, twists: Twists, poses: Poses, steps: int) -> Poses:
-    """Poses after at most so many steps that lower their energies."""
+    """Return poses after at most so many steps that lower their energies."""
     result, d = np.array(poses.numbers), len(twists.basis)
 
-    def own() -> Fit:
+    def new_scratch() -> Fit:
         normal, right, factor = scratch(d, d), scratch(d), scratch(d, d)
         return Fit(energy.scratch(), scratch(8, 6), normal, right, factor, scratch(d), scratch(6))
 
     def run(first: int, last: int, fit: Any) -> None:
         fit_poses(energy.model, energy.likelihood, twists, result, steps, first, last, fit)
 
-    parallel_for(run, len(result), own, least=8)
+    parallel_for(run, len(result), new_scratch, least=8)
     return Poses(result)
 
 
@@ -98,6 +101,7 @@ def fit_poses(model, likelihood, twists, poses, steps, first, last, fit):
 
 @inner
 def _fitted(model, likelihood, twists, pose, steps, fit):
+    """Return a pose after up to so many steps that lower its energy."""
     dimension, damping = len(twists.basis), _FIRST_DAMPING
     gather_free(model, pose, _SLACK, fit.work)
     known = known_energy(model, likelihood, pose, np.inf, fit.work.sums)
@@ -143,7 +147,7 @@ def _linearise(model, likelihood, twists, pose, costs, fit):
         _add(sums, twists.pivot, pose, point, looked_up, residual, slope)
     for n in range(look_around(model, pose, work)):
         point = free_point(model, work, n)
-        cell, u, v, w = place_of(model, pose, point)
+        cell, u, v, w = free_cell(model, pose, point)
         if cell >= 0:
             looked_up = distance_between_nodes(field.box, field.table, cell, u, v, w)
             depth = model.alpha - looked_up[0]
@@ -231,7 +235,7 @@ def _solve(fit, damping):
 
 @inner
 def _moved_by(twists, pose, fit):
-    """The pose moved by the twist of the solution, shortened to what a step may be."""
+    """Return the pose moved by the twist of the solution, shortened to what a step may be."""
     basis, twist = twists.basis, fit.twist
     for i in range(6):
         twist[i] = 0.0
@@ -249,7 +253,7 @@ def _moved_by(twists, pose, fit):
 
 @leaf
 def moved_about(pose, pivot, turn, shift):
-    """x -> E (R x + t - p) + p + u: a pose turned about a point of the object, and shifted.
+    """Return x -> E (R x + t - p) + p + u: a pose turned about a point of the object, and shifted.
 
     E turns about `turn`, by twice the arctangent of half of its length (Cayley).
     """

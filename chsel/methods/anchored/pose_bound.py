@@ -1,37 +1,30 @@
-"""How far poses are from the best of them, but for symmetries of the object."""
+"""The distance and the angle between the best of some poses and the farthest from it."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from chsel.methods.anchored.energy import Energy
 from chsel.methods.anchored.fitting import fitted, twists_of
+from chsel.methods.anchored.near_symmetries import energy_in_itself, turned_about
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.noise import noise_model
-from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.poses import Poses, compose, product, rotated, rotation_angle
-from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.poses import Poses, product, rotated, rotation_angle
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SE3Space
-from chsel.problem.streams import StreamKey
-from chsel.problem.surface import (
-    has_surface,
-    outline_distances_to,
-    outline_in_object,
-)
+from chsel.problem.surface import has_surface, outline_distances_to
 from chsel.problem.trust import SYMMETRIC, middle
 
+# Where these numbers are from: docs/anchored.md, "Numbers that are no settings".
 _SOFT = 0.02  # diameters: noise of the fit of an object to itself
-_STEPS = 20
-_SMALL = 0.05  # radians: turns that are taken as they are
+_STEPS = 20  # of this fit
+_SMALL = 0.05  # radians: turns up to it are taken as they are, without looking for a symmetry
 
 
 def pose_bound(sdf: SdfGrid, poses: Poses) -> tuple[float, float]:
-    """How far the farthest of poses (B, 12) is from the first: metres and radians.
+    """Return how far the farthest of poses (B, 12) is from the first, in metres and in radians.
 
-    Of the object's centre, and turned. A turn counts as what is left of it after the symmetry of
-    the object nearest to it: a motion that moves the surface by at most SYMMETRIC diameters, root
-    mean square. It is found by fitting the object, turned, to itself.
+    In metres: the object's centre. In radians: the turn that is left after the nearest symmetry of
+    the object, a motion that moves the surface by at most SYMMETRIC diameters, root mean square. It
+    is found by fitting the object, turned, to itself.
     """
     if not has_surface(sdf):
         return 0.0, 0.0
@@ -47,24 +40,12 @@ def pose_bound(sdf: SdfGrid, poses: Poses) -> tuple[float, float]:
 
 
 def _left(sdf: SdfGrid, centre: FloatArray, turns: FloatArray) -> FloatArray:
-    """Angles (B,), radians, of turns (B, 3, 3) of the object after the symmetry nearest to each."""
+    """Return angles (B,), radians, that turns (B, 3, 3) have left after their nearest symmetry."""
     angles = rotation_angle(turns)
     if len(turns) == 0:
         return angles
-    identity = np.eye(4)[None]
-    around = Workspace(tuple(sdf.bounds[0]), tuple(sdf.bounds[1]))
-    surface = KnownPoints(known=outline_in_object(sdf))
-    itself = RegistrationProblem(
-        sdf,
-        surface,
-        initial_set=identity,
-        workspace=around,
-        free_resolution=sdf.resolution,
-        key=StreamKey(0, 0),
-    )
-    energy = Energy(itself, surface, noise_model(_SOFT * sdf.diameter))
-    turned = Poses.of(compose(turns, centre - rotated(turns, centre)))
-    fits = fitted(energy, twists_of(SE3Space(), centre), turned, _STEPS)
-    alike = outline_distances_to(sdf, fits, Poses.of(identity)) <= SYMMETRIC * sdf.diameter
+    energy = energy_in_itself(sdf, _SOFT * sdf.diameter)
+    fits = fitted(energy, twists_of(SE3Space(), centre), turned_about(centre, turns), _STEPS)
+    alike = outline_distances_to(sdf, fits, Poses.of(np.eye(4)[None])) <= SYMMETRIC * sdf.diameter
     left = rotation_angle(product(turns, np.swapaxes(fits.rotations, 1, 2)))
     return np.where(alike, np.minimum(left, angles), angles)

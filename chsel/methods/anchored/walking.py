@@ -25,34 +25,40 @@ from chsel.problem.poses import Poses
 from chsel.problem.search_space import SE2Space, SearchSpace
 from chsel.problem.streams import Stream, fill_uniforms
 
+# Where these numbers are from: docs/anchored.md, "Numbers that are no settings".
 _DRAWS = 10  # random numbers that a move takes
 _MOVES = 8  # whose random numbers are drawn together
-_FIRST, _LEAST, _MOST = 0.01, 0.00005, 0.03  # metres: the size of moves
-_GROW, _SHRINK = 1.1, 0.97  # it, after a move that was accepted or refused
-_SMALLEST, _RANGE = 0.12589254117941673, 2.763102111592855  # a move's factor: 10^U(-0.9, 0.3)
+_FIRST = 0.01  # metres: the size of moves at first,
+_LEAST = 0.00005  # at least,
+_MOST = 0.03  # and at most
+_GROW = 1.1  # factor of the size after a move that was accepted
+_SHRINK = 0.97  # and after one that was refused
+_SMALLEST = 0.12589254117941673  # least factor of a single move's size, 10^U(-0.9, 0.3)
+_RANGE = 2.763102111592855  # of the logarithm of this factor
 _PER_METRE = 6.0  # radians that go with a metre
 _ABOUT_CONTACT = 0.6  # share of the turns that are about a contact
 _DEVIATION = 3.4641016151377544  # uniform numbers of [-1/2, 1/2] times it have a deviation of 1
 _SLACKS = 3.0  # sizes of a step that gathered points should last
-_LEAST_SLACK, _MOST_SLACK = 0.006, 0.02  # metres
+_LEAST_SLACK = 0.006  # metres
+_MOST_SLACK = 0.02  # metres
 _LARGE = 0.015  # metres: steps of this size leave any slack at once
 _TOO_MUCH = 3.0  # times the slack that would last: points are gathered again
 
 
 class Stride(NamedTuple):
-    """How poses move."""
+    """The motions of a walk."""
 
     planar: bool  # turns are about the axis alone, and shifts across it
-    axis: tuple[float, float, float]
+    axis: tuple[float, float, float]  # of the plane, unit length
     pivot: tuple[float, float, float]  # of the object, where it does not turn about a contact
     lower: tuple[float, float, float]  # where the object's origin may be in the world
-    upper: tuple[float, float, float]
+    upper: tuple[float, float, float]  # the other corner
 
 
 def stride_of(
     space: SearchSpace, pivot: FloatArray, bounds: tuple[FloatArray, FloatArray]
 ) -> Stride:
-    """Moves in a space, about a point (3,) of the object or a contact; bounds: of its origin."""
+    """Return moves in a space, about a point (3,) of the object or a contact."""
     planar = isinstance(space, SE2Space)
     axis = triple(space.axis) if isinstance(space, SE2Space) else (0.0, 0.0, 0.0)
     return Stride(planar, axis, triple(pivot), triple(bounds[0]), triple(bounds[1]))
@@ -77,7 +83,7 @@ def walked(
     stream: Stream,
     kept: int = 0,
 ) -> Chains:
-    """Chains from C poses with energies (C,), after so many moves.
+    """Return chains from C poses with energies (C,), after so many moves.
 
     floor: the energy that they come down to, or stay below, see walk_below. kept: states of each.
     """
@@ -85,13 +91,13 @@ def walked(
     states = np.zeros((count, kept, 12)), np.full((count, kept), np.inf)
     chains = Chains(np.array(poses.numbers), np.array(energies), *states)
 
-    def own() -> tuple[Scratch, Any]:
+    def new_scratch() -> tuple[Scratch, Any]:
         return energy.scratch(), scratch(_MOVES * _DRAWS + 16, dtype=np.float32)
 
     def run(first: int, last: int, work: Any) -> None:
         walk_below(model, likelihood, stride, floor, chains, stream, moves, first, last, *work)
 
-    parallel_for(run, count, own, least=2)
+    parallel_for(run, count, new_scratch, least=2)
     return chains
 
 
@@ -144,13 +150,13 @@ def walk_below(model, likelihood, stride, floor, chains, stream, moves, first, l
 
 @leaf
 def _slack_for(size):
-    """How far the object may move, at steps of a size, until points are gathered again."""
+    """Return the distance that gathered points should last for, at steps of a size, metres."""
     return min(max(_SLACKS * size, _LEAST_SLACK), _MOST_SLACK) if size < _LARGE else 0.0
 
 
 @inner
 def _proposed(model, stride, pose, size, draw):
-    """A pose near by. draw (9,): of a factor of the size, two choices, a turn, and a shift."""
+    """Return a pose near by. draw (9,): factor of the size, two choices, a turn, and a shift."""
     size *= _SMALLEST * exp(_RANGE * draw[0])
     shift, turn, known = size * _DEVIATION, size * _DEVIATION * _PER_METRE, model.known
     a, b, c = turn * (draw[3] - 0.5), turn * (draw[4] - 0.5), turn * (draw[5] - 0.5)

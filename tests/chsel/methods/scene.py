@@ -1,4 +1,9 @@
-"""What tests of methods share: bodies, what is known of them, and an observer."""
+"""The scene of tests of methods: an L (MESH, GRID) or a box (BOX, BOX_GRID) whose pose is TRUTH.
+
+POINTS are 40 contacts with the L at TRUTH and the free voxels around it; `posed(method, points)` is
+a problem of the L, `box_problem(points)` one of the box, and `energy_of(points, noise)` the energy
+of poses of the box. A `Watcher` is an observer that keeps what it sees.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +27,7 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from tests.chsel.samples import pose_problem
 
+# world_from_object: tilted, and upright
 TRUTH = compose(axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3]))
 STANDING = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(2.0)), np.array([0.2, 0.1, 0.3]))
 WORKSPACE = Workspace((-0.1, -0.2, 0.0), (0.5, 0.4, 0.6))
@@ -35,7 +41,7 @@ def l_shape():
     return trimesh.boolean.union(parts, engine="manifold")
 
 
-MESH = l_shape()
+MESH = l_shape()  # in its frame, 20 x 14 x 10 cm
 GRID = SdfGrid.from_mesh(MESH, 0.01)
 BOX_SIDES = np.array([0.2, 0.12, 0.08])
 BOX = trimesh.creation.box(BOX_SIDES)
@@ -127,7 +133,7 @@ def around_truth(count=8, angle=0.3, shift=0.03):
 
 
 class Trace(NamedTuple):
-    """What an observer is shown of a search."""
+    """A state of a search that an observer sees."""
 
     stage: str
     iteration: int

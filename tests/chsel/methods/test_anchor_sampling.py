@@ -11,11 +11,11 @@ from chsel.methods.anchor_sampling import (
     AnchoredStarts,
     AnchorSampler,
     AnchorSettings,
-    _sines_cosines,
     anchored_starts,
     most_informative_first,
 )
 from chsel.methods.chsel import Chsel
+from chsel.numerics.elementary import sines_cosines_of_turns
 from chsel.numerics.threads import threads
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, compose, inverse
@@ -91,7 +91,8 @@ def test_the_best_are_the_first_of_all_and_do_not_depend_on_threads():
 def test_sines_and_cosines_are_those_of_shares_of_a_turn():
     shares = np.linspace(0.0, 1.0, 1000, endpoint=False, dtype=np.float32)
     angles = 2.0 * np.pi * shares.astype(np.float64)
-    np.testing.assert_allclose(_sines_cosines(shares), [np.sin(angles), np.cos(angles)], atol=1e-6)
+    found = sines_cosines_of_turns(shares)
+    np.testing.assert_allclose(found, [np.sin(angles), np.cos(angles)], atol=1e-6)
 
 
 @pytest.mark.parametrize(("axis", "value"), [((0.0, 0.0, 1.0), 0.02), ((0.48, 0.6, 0.64), 0.0)])

@@ -1,4 +1,11 @@
-"""The contact-anchored search: what it finds, and that odd problems have results."""
+"""The contact-anchored search: what it finds, and that odd problems have results.
+
+The scene (scene.py): an L of 20 x 14 x 10 cm (GRID) is at TRUTH, world_from_object.
+POINTS are 40 contacts all over it and the free voxels (SIDE) of the workspace around it, ODD odd
+sets of points by name. `posed(method, points, ...)` is the problem that a method gets, with E_0
+anywhere, or from a previous result; `around_truth` are poses near the true one. A Watcher keeps
+what an observer sees. `plain_energies` is the formula of chsel/problem/noise.py in numpy.
+"""
 
 from dataclasses import replace
 
@@ -9,10 +16,13 @@ import trimesh
 from chsel.errors import ChselError
 from chsel.methods import build_method
 from chsel.methods.anchor_sampling import AnchorSampler, most_informative_first
-from chsel.methods.anchored.anchored import Anchored, AnchoredSettings, Effort, Search, distinct
+from chsel.methods.anchored.anchored import Anchored
+from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
 from chsel.methods.anchored.energy import Energy
+from chsel.methods.anchored.search import Search
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
+from chsel.problem.basins import basin_bests
 from chsel.problem.noise import LATER, WRONG, noise_model
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, axis_angle, check_rigid, compose, inverse
@@ -66,7 +76,7 @@ def anchored(effort=EFFORT, **changes):
 def registered(method, problem, observer=None):
     """The result, found to be whole: as many rigid poses as E_0 has, with their energies."""
     search = Search(problem, method.settings, observer or NullObserver())
-    found = search.hypotheses(search.spread(search.minima()))
+    found = search.choose(search.spread(search.minima()))
     assert found.digest == method.register(problem).digest
     assert len(found.object_from_world) == len(problem.initial_set)
     check_rigid("hypotheses", found.object_from_world)
@@ -100,10 +110,11 @@ def test_odd_points_have_results(name):
     registered(method, posed(method, ODD[name]))
 
 
-def test_poses_are_rated_by_64_contacts_that_are_far_apart():
-    method = anchored()
+@pytest.mark.parametrize("contacts", [64, 5])
+def test_poses_are_rated_by_some_contacts_that_are_far_apart(contacts):
+    method = anchored() if contacts == 64 else anchored(replace(EFFORT, contacts=contacts))
     points = most_informative_first(ODD["hundreds"])
-    few = replace(points, known=points.known[:64], known_sdf=points.sdf[:64])
+    few = replace(points, known=points.known[:contacts], known_sdf=points.sdf[:contacts])
     poses = Poses.of(posed(method).initial_set[:4])
     found = Search(posed(method, points), method.settings, NullObserver()).energy.of(poses)
     expected = Energy(posed(method, few), few, noise_model(method.settings.noise)).of(poses)
@@ -139,6 +150,16 @@ def test_few_contacts_leave_many_distinct_poses():
     assert spread.max() > 0.03
 
 
+@pytest.mark.parametrize(("states", "chains"), [(6, 12), (2, 30), (1, 60)])
+def test_candidates_are_minima_and_states_of_walks_twice_as_many_as_hypotheses(states, chains):
+    """Twelve walks by the settings, and more where they would give too few."""
+    method = anchored(replace(EFFORT, states=states), limit=1e6)
+    search = Search(posed(method, FEW), method.settings, NullObserver())
+    minima = search.minima()
+    candidates = search.spread(minima)
+    assert len(candidates.energies) == len(minima.energies) + states * chains
+
+
 @pytest.mark.parametrize("points", [FEW, INEXACT], ids=["few", "inexact"])
 def test_candidates_are_below_the_limit_and_costs_the_plain_formula(points):
     method = anchored(limit=4.0)
@@ -148,7 +169,7 @@ def test_candidates_are_below_the_limit_and_costs_the_plain_formula(points):
     candidates = search.spread(minima)
     assert candidates.energies[0] == candidates.energies.min()
     assert 2.0 < candidates.energies.max() - minima.energies.min() <= 4.0
-    found = search.hypotheses(candidates)
+    found = search.choose(candidates)
     assert found.cost[0] == pytest.approx(candidates.energies[0], abs=1e-9)
     poses = Poses.of(found.object_from_world[::3])
     expected = plain_energies(noise_model(method.settings.noise), GRID, points, poses)
@@ -197,12 +218,13 @@ def rounds_of(method, problem):
 
 def test_rounds_go_on_while_there_are_new_modes_and_stop_at_the_budget():
     one = EFFORT.samples + 24 * 5 + 12 * 8 + 8 * 30
-    for points, budget, rounds in (
-        (POINTS, 0, 1),
-        (POINTS, 12 * one, 2),  # of one mode, which the second round confirms
-        (FEW, 2 * one + 1, 3),
+    for points, budget, most, rounds in (
+        (POINTS, 0, 12, 1),
+        (POINTS, 12 * one, 12, 2),  # of one mode, which the second round confirms
+        (FEW, 2 * one + 1, 12, 3),
+        (FEW, 2 * one + 1, 2, 2),
     ):
-        method = anchored(replace(EFFORT, evaluations=budget))
+        method = anchored(replace(EFFORT, evaluations=budget, rounds=most))
         assert rounds_of(method, posed(method, points)) == rounds
 
 
@@ -343,10 +365,12 @@ def test_a_grid_without_a_node_inside_is_one_clear_error():
     assert "\n" not in str(raised.value)
 
 
-def test_hypotheses_are_chosen_for_the_least_expected_plausible_diversity():
+@pytest.mark.parametrize(("modes", "reach"), [(3, 1.0), (1, 2.0)])
+def test_hypotheses_are_chosen_for_the_least_expected_plausible_diversity(modes, reach):
     count = 6
     problem = posed(anchored(), INEXACT_FEW, initial_set=np.tile(inverse(TRUTH), (count, 1, 1)))
-    search = Search(problem, AnchoredSettings(effort=EFFORT), NullObserver())
+    settings = AnchoredSettings(effort=EFFORT, modes=modes, reach=reach)
+    search = Search(problem, settings, NullObserver())
     every = search.spread(search.minima())
     candidates = every.chosen(np.arange(40) * len(every.energies) // 40)
     energies = candidates.energies
@@ -357,14 +381,14 @@ def test_hypotheses_are_chosen_for_the_least_expected_plausible_diversity():
         """Of hypotheses, over all candidates that may be the true pose."""
         total = 0.0
         for truth in energies:
-            between = apart[np.ix_(energies <= truth + 1.0, chosen)]
+            between = apart[np.ix_(energies <= truth + reach, chosen)]
             total += between.min(axis=1).mean() + between.min(axis=0).sum() / count
         return total
 
     likely = candidates.poses[: int((energies <= energies[0] + 3.0).sum())]
-    chosen = distinct(problem.sdf, likely, 3).tolist()
+    chosen = basin_bests(problem.sdf, likely, modes).tolist()
     while len(chosen) < count:
         others = [i for i in range(len(energies)) if i not in chosen]
         chosen.append(min(others, key=lambda i: expected_diversity([*chosen, i])))
-    found = search.hypotheses(candidates).object_from_world
+    found = search.choose(candidates).object_from_world
     np.testing.assert_allclose(found, candidates.poses.matrices[sorted(chosen)], atol=1e-9)

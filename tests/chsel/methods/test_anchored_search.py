@@ -1,26 +1,28 @@
-"""The stages of anchored: modes, walks and fits."""
+"""The kernels of anchored: walks and fits.
+
+A box of 20 x 12 x 8 cm (BOX_GRID) is at TRUTH, world_from_object, or upright at STANDING.
+`on_faces(count, height)` are points over its faces in its frame, `poses_around_truth` poses off by
+a length and an angle, `energy_of` the kernel's energy by points and noise, and `plain_energies` the
+formula of chsel/problem/noise.py in numpy.
+"""
 
 import math
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.optimize import minimize
 
-from chsel.methods.anchored.anchored import FAR, distinct, has_new_mode, near_symmetries
 from chsel.methods.anchored.fitting import fitted, twists_of
 from chsel.methods.anchored.walking import stride_of, walked
 from chsel.problem.noise import EXTENT, LEVELS, SHARE, NoiseModel, noise_model
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, rotation_angle
-from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import PlaneSettings, SE3Space, origin_bounds, search_space
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import object_centre
 from tests.chsel.methods.scene import (
     BOX_GRID,
     BOX_SIDES,
-    GRID,
     STANDING,
     TRUTH,
     WORKSPACE,
@@ -39,52 +41,6 @@ def turned(angle, shift=0.0):
 
 def poses_of(*world_from_object):
     return Poses.of(inverse(np.array(world_from_object)))
-
-
-def test_distinct_poses_are_apart_in_surface_or_turn():
-    """A half turn of a box leaves its surface where it was."""
-    some = [turned(0.0), turned(0.02), turned(math.pi), turned(math.pi, 0.002), turned(0.0, 0.06)]
-    some += [turned(0.0, 0.061)]
-    assert distinct(BOX_GRID, poses_of(*some), 9).tolist() == [0, 2, 4]
-    assert distinct(BOX_GRID, poses_of(*some[::-1]), 9).tolist() == [0, 2, 4]
-    assert distinct(BOX_GRID, poses_of(*some), 2).tolist() == [0, 2]
-    assert distinct(BOX_GRID, poses_of(*some), 9, np.inf).tolist() == [0, 2]  # by turns alone
-
-
-def test_a_new_mode_is_farther_than_the_old_ones_are_from_each_other():
-    near, far = [turned(0.0, 0.001 * n) for n in range(5)], [turned(0.0, 0.1)]
-    assert not has_new_mode(BOX_GRID, poses_of(*near[:2]), poses_of(*near[2:]), 30)
-    assert has_new_mode(BOX_GRID, poses_of(*near), poses_of(near[0], *far), 30)
-    spread = poses_of(*(turned(0.0, FAR * n) for n in (0, 14, 20, 30)))
-    beside, between = poses_of(turned(0.0, FAR * 38)), poses_of(turned(0.0, FAR * 25))
-    assert has_new_mode(BOX_GRID, spread, beside, 4)
-    assert not has_new_mode(BOX_GRID, spread, beside, 3)  # 14 cm from each other
-    assert not has_new_mode(BOX_GRID, spread, between, 4)
-    none = Poses(np.zeros((0, 12)))
-    assert has_new_mode(BOX_GRID, none, spread, 30)
-    assert not has_new_mode(BOX_GRID, spread, none, 30)
-
-
-@pytest.mark.parametrize(
-    ("sides", "halves", "quarters"),
-    [((0.1, 0.06, 0.16), 3, 0), ((0.1, 0.102, 0.16), 5, 2)],
-)
-def test_near_symmetries_of_a_box(sides, halves, quarters):
-    """Of two sides 2 mm apart also half turns about their diagonals, and quarter turns."""
-    sdf = SdfGrid.from_mesh(trimesh.creation.box(sides), 0.005)
-    found = near_symmetries(sdf)
-    angles = rotation_angle(found[:, :3, :3])
-    assert (np.abs(angles - np.pi) < 0.02).sum() == halves
-    assert (np.abs(angles - 0.5 * np.pi) < 0.02).sum() == quarters
-    assert len(found) == halves + quarters
-    np.testing.assert_allclose(np.sort(np.abs(found[:, :3, :3]), axis=2)[..., :2], 0.0, atol=0.02)
-    np.testing.assert_allclose(found[:, :3, 3], 0.0, atol=0.001)
-
-
-def test_an_object_without_symmetry_has_none():
-    assert near_symmetries(GRID).shape == (0, 4, 4)
-    nowhere = SdfGrid(GRID.origin, 0.01, np.abs(GRID.values) + 0.01, GRID.gradients)
-    assert near_symmetries(nowhere).shape == (0, 4, 4)
 
 
 PLANE = PlaneSettings(plane_height=0.3 - 0.5 * BOX_SIDES[2])  # on which the box is at STANDING

@@ -12,7 +12,7 @@ import pytest
 from chsel.cost.cost_settings import CostSettings
 from chsel.errors import SettingError
 from chsel.methods import OURS, build_method, preset_settings
-from chsel.methods.anchored.anchored import AnchoredSettings, Effort
+from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
 from chsel.methods.cvo import CvoSettings
 from chsel.methods.gradient_descent import DescentSettings
 from chsel.methods.icp import Icp, IcpSettings

@@ -9,7 +9,8 @@ import trimesh
 import chsel
 from chsel import KnownPoints, Loop, Probe, Pushes, trust_in
 from chsel.errors import PointsError, SettingError
-from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
+from chsel.methods.anchored.anchored import Anchored
+from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.poses import Poses, compose, inverse
 from chsel.problem.surface import outline_distances_to

@@ -202,4 +202,4 @@ def test_copies_are_chosen_once():
 def test_points_far_apart_are_each_the_farthest_from_those_before():
     points = np.array([[0.0], [1.0], [10.0], [4.0]])
     assert farthest_points(points, 4).tolist() == [0, 2, 3, 1]
-    assert farthest_points(points, 3, given=2).tolist() == [0, 1, 2]
+    assert farthest_points(points, 3, chosen_first=2).tolist() == [0, 1, 2]

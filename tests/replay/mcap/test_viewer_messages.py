@@ -10,8 +10,9 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 
 from chsel.events import Believed, Decided, HypothesesFound, Probe
+from chsel.problem.points import POINT_CLASSES
 from chsel.problem.poses import axis_angle, inverse, rotation_matrices
-from replay.mcap.foxglove_messages import POINT_CLASSES, VIEWS
+from replay.mcap.foxglove_messages import VIEWS
 from replay.mcap.schemas import STEP_TIME
 from replay.mcap.viewer_messages import modes, next_probe
 from tests.replay.conftest import example_events, nth
