@@ -1,12 +1,14 @@
 """Objects, points and poses that tests share, and search spaces in torch."""
 
 import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 import trimesh
 
+from chsel.methods.anchored.anchored import AnchoredSettings
 from chsel.problem.noise import EXTENT, INDEPENDENT, LATER, SHARE
 from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.poses import apply, compose, hat, random_rotations
@@ -99,6 +101,30 @@ def hypotheses_at(object_from_world, duplicate=None):
         cell=np.full(count, -1),
         elites=object_from_world,
     )
+
+
+@dataclass(frozen=True)
+class Scripted:
+    """A method that finds given poses (K, 4, 4): the first set of them, then the next one."""
+
+    script: list
+    noise: float = 0.0005
+    push_distance: float = 0.0
+
+    @property
+    def settings(self):
+        """Those of a method with a setting for the sensor's noise."""
+        return AnchoredSettings(noise=self.noise)
+
+    @property
+    def online(self):
+        """As of other methods."""
+        return self.settings.online
+
+    def register(self, problem, observer=None):
+        """The poses of the step."""
+        poses = self.script[min(max(problem.key.step, 0), len(self.script) - 1)]
+        return replace(hypotheses_at(poses), push_distance=self.push_distance)
 
 
 def decode(space, vectors):
