@@ -40,6 +40,21 @@ def bracket():
     return trimesh.boolean.union(parts).apply_scale(0.001)
 
 
+def box_with_knob(sides):
+    """A box with a knob beside the middle of its top, and points (24, 3) of its other sides.
+
+    Turned by pi about its z axis, the body fits these points as well.
+    """
+    x, y, z = 0.5 * np.asarray(sides)
+    knob = trimesh.creation.box(bounds=[[0.0, -y, z], [x, y, 1.5 * z]])
+    body = trimesh.boolean.union([trimesh.creation.box(sides), knob], engine="manifold")
+    points = np.random.default_rng(1).uniform(-0.45, 0.45, (24, 3)) * sides
+    for n, (axis, sign) in enumerate([(0, 1), (0, -1), (1, 1), (1, -1), (2, -1)] * 5):
+        if n < len(points):
+            points[n, axis] = 0.5 * sign * sides[axis]
+    return body, points
+
+
 def box_distance(points, sides):
     """Signed distances (...) of points (..., 3) to a box around the origin."""
     beyond = np.abs(points) - 0.5 * sides

@@ -168,10 +168,27 @@ def test_the_archive_leads_on_to_the_next_step():
 
 
 def test_a_good_pose_of_the_last_step_is_not_lost():
-    """Even if hardly any samples are drawn."""
-    method = anchored(replace(EFFORT, samples=10))
+    """It is in E_l alone, and nothing else is searched: a sample, without a fit."""
+    few = Effort(
+        samples=1,
+        kept=1,
+        first_steps=0,
+        refined=1,
+        steps=0,
+        descents=1,
+        descent_moves=1,
+        chains=1,
+        moves=1,
+        polished=1,
+        polish_moves=1,
+        evaluations=0,
+    )
+    method = anchored(few)
     problem = posed(method, low_cost_set=inverse(TRUTH)[None])
-    assert_found(registered(method, problem))
+    assert_found(method.register(problem))
+    without = method.register(posed(method))
+    position, _ = pose_errors(without.object_from_world[:1], TRUTH, ObjectSymmetry())
+    assert position[0] > 0.02
 
 
 def test_as_many_hypotheses_come_as_are_wanted():

@@ -113,7 +113,7 @@ def test_a_session_that_was_not_told_notices_that_touches_move_the_object(moves)
         assert session.trust.misfit > 2.0
         found = session.check_moved()
         if moves > 0.0:
-            assert 0.0 < session.check_moved(most=0.0055) <= 0.0055
+            assert session.check_moved(most=0.004) <= 0.004
     assert found == pytest.approx(moves, abs=0.001)
     texts = [event.text for event in recorder.events if isinstance(event, Logged)]
     moved = [text for text in texts if "each touch has moved the object by" in text]
@@ -173,7 +173,7 @@ def test_the_largest_distance_is_tried_and_found():
 
 
 def test_noisy_contacts_of_an_object_that_stands_are_no_pushes():
-    """They are off by 3 mm, and twelve pushes were possible; so a push explains them a bit better."""
+    """They are off by 3 mm, and pushes explain that a bit better."""
     contacts, random = known_points(STANDING, 12).known, np.random.default_rng(0)
     contacts = contacts + random.normal(0.0, 0.003, contacts.shape)
     loop = OnlineRegistration(GRID, WORKSPACE, SIDE, SETTINGS, push_distance=0.0125)
@@ -209,7 +209,7 @@ def test_another_problem_is_fitted_elsewhere_by_its_own_points():
     here = OnlineRegistration(
         GRID, WORKSPACE, SIDE, SETTINGS, points=KnownPoints(known=known_points(STANDING, 24).known)
     ).pose(0)
-    there = replace(here, points=KnownPoints(known=here.points.known + [0.05, 0.0, 0.0]))
+    there = replace(here, points=KnownPoints(known=here.points.known + np.array([0.05, 0, 0])))
     far = STANDING.copy()
     far[0, 3] += 0.05
     best, moved = hypotheses_at(inverse(STANDING[None])), Poses.of(inverse(far[None]))
