@@ -1,12 +1,14 @@
 """Objects, points and poses that tests share, and search spaces in torch."""
 
 import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 import trimesh
 
+from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.problem.initial_sets import posed_problem
 from chsel.problem.noise import EXTENT, INDEPENDENT, LATER, SHARE
 from chsel.problem.poses import apply, compose, hat, random_rotations
@@ -36,6 +38,21 @@ def bracket():
     """An L of 80 x 60 x 40 mm with walls of 6 mm, a corner at the origin."""
     parts = [trimesh.creation.box(bounds=[[0, 0, 0], top]) for top in ([80, 6, 40], [6, 60, 40])]
     return trimesh.boolean.union(parts).apply_scale(0.001)
+
+
+def box_with_knob(sides):
+    """A box with a knob beside the middle of its top, and points (24, 3) of its other sides.
+
+    Turned by pi about its z axis, the body fits these points as well.
+    """
+    x, y, z = 0.5 * np.asarray(sides)
+    knob = trimesh.creation.box(bounds=[[0.0, -y, z], [x, y, 1.5 * z]])
+    body = trimesh.boolean.union([trimesh.creation.box(sides), knob], engine="manifold")
+    points = np.random.default_rng(1).uniform(-0.45, 0.45, (24, 3)) * sides
+    for n, (axis, sign) in enumerate([(0, 1), (0, -1), (1, 1), (1, -1), (2, -1)] * 5):
+        if n < len(points):
+            points[n, axis] = 0.5 * sign * sides[axis]
+    return body, points
 
 
 def box_distance(points, sides):
@@ -99,6 +116,30 @@ def hypotheses_at(object_from_world, duplicate=None):
         cell=np.full(count, -1),
         elites=object_from_world,
     )
+
+
+@dataclass(frozen=True)
+class Scripted:
+    """A method that finds given poses (K, 4, 4): the first set of them, then the next one."""
+
+    script: list
+    noise: float = 0.0005
+    push_distance: float = 0.0
+
+    @property
+    def settings(self):
+        """Those of a method with a setting for the sensor's noise."""
+        return AnchoredSettings(noise=self.noise)
+
+    @property
+    def online(self):
+        """As of other methods."""
+        return self.settings.online
+
+    def register(self, problem, observer=None):
+        """The poses of the step."""
+        poses = self.script[min(max(problem.key.step, 0), len(self.script) - 1)]
+        return replace(hypotheses_at(poses), push_distance=self.push_distance)
 
 
 def decode(space, vectors):

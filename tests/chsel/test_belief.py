@@ -1,7 +1,6 @@
 """What a set of hypotheses means, by sets whose meaning is known."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +9,10 @@ from scipy.stats import norm
 
 import chsel
 from chsel.belief import Gripper, PoseBelief, wilson
-from chsel.events import Believed
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.poses import axis_angle, compose, inverse, rotation_vector
 from chsel.problem.registration_problem import Hypotheses, Trust
 from chsel.problem.sdf_grid import SdfGrid
-from replay.mcap.reader import read_recording
 
 SIDES = np.array([0.20, 0.06, 0.08])
 BOX = trimesh.creation.box(SIDES)
@@ -24,7 +21,6 @@ L_SHAPE = trimesh.boolean.union(
 )
 GRID, L_GRID = SdfGrid.from_mesh(BOX, 0.004), SdfGrid.from_mesh(L_SHAPE, 0.004)
 Z, STILL = np.array([0.0, 0.0, 1.0]), np.eye(4)
-NEITHER = np.zeros(2, dtype=bool)
 HALF_TURN = compose(axis_angle(Z, np.array(math.pi)), np.zeros(3))
 
 
@@ -157,24 +153,88 @@ def test_what_a_belief_does_not_accept():
     assert len(repr(belief).splitlines()) <= 5
 
 
-def test_a_belief_that_is_asked_for_is_recorded_and_a_sure_grasp_ends_touching(tmp_path):
-    contacts = trimesh.sample.sample_surface(L_SHAPE, 12, seed=1)[0]
-    hand = trimesh.creation.box([0.02, 0.02, 0.1])
-    above = compose(np.diag([1.0, -1.0, -1.0]), np.array([-0.05, 0.0, 0.03]))
-    with chsel.Session(L_SHAPE, record=tmp_path / "a.mcap", hand=hand) as session:
-        session.add(contacts=contacts)
-        found = session.register()
-        (mode,) = session.belief.modes
-        off = shifted(np.array([[0.01, 0.0, 0.0]]), about=inverse(found.object_from_world[0]))
-        poses = np.concatenate([found.object_from_world[:1], inverse(off)])
-        two = replace(found, object_from_world=poses, cost=np.arange(2.0), duplicate=NEITHER)
-        assert len(PoseBelief(session.started.sdf, two)) == 2
-        assert len(PoseBelief(session.started.sdf, two, problem=session.problem)) == 1
-        assert session.next_probe(grasps=(above[None], 0.07), sure=0.9) is None
-        assert session.stop == "grasp"
-    (told,) = [e for e in read_recording(tmp_path / "a.mcap").events() if isinstance(e, Believed)]
-    np.testing.assert_array_equal(told.object_from_world, mode.object_from_world[None])
-    np.testing.assert_array_equal(told.covariances, mode.covariance[None])
-    np.testing.assert_allclose(told.centres[0], L_SHAPE.centroid, atol=0.01)
-    assert (told.numbers.tolist(), told.weights.tolist()) == ([0], [1.0])
-    np.testing.assert_allclose(session.grasp[:3, 3], above[:3, 3], atol=0.005)
+TILTED = compose(axis_angle(np.array([0.48, 0.6, 0.64]), np.array(0.9)), np.array([0.3, -0.1, 0.2]))
+
+
+def boxes_along_x(*places, verdict="several modes"):
+    """A belief of boxes at places, each turned as TILTED and shifted along its own x axis."""
+    shifts = np.array([[place, 0.0, 0.0] for place in places])
+    return PoseBelief(GRID, result(TILTED @ shifted(shifts), verdict=verdict))
+
+
+def test_a_member_counts_for_the_mode_that_it_is_not_turned_against():
+    """Two places of the L, turned by pi against each other; its arm is all that tells them apart.
+
+    The third pose is the first one, moved by as much as the second is: it covers nearly the same
+    space as the second one, but is turned as the first one.
+    """
+    knob = trimesh.creation.box(bounds=[[0.06, -0.03, 0.03], [0.10, 0.03, 0.06]])
+    grid = SdfGrid.from_mesh(trimesh.boolean.union([BOX, knob], engine="manifold"), 0.004)
+    shift = compose(np.eye(3), np.array([0.0, 0.03, 0.0]))
+    first, second, third = np.eye(4), shift @ HALF_TURN, shift
+    modes = PoseBelief(grid, result(np.stack([first, second, third]), (0, 1))).modes
+    assert [mode.members.tolist() for mode in modes] == [[0, 2], [1]]
+    assert modes[0].deviations == pytest.approx((0.03 / np.sqrt(2.0), 0.0), abs=1e-6)
+    assert modes[1].deviations == pytest.approx((0.0, 0.0), abs=1e-6)
+
+
+def test_a_hand_that_encloses_or_passes_through_the_object_meets_it():
+    """All its corners are outside: of a box of 0.5 m around the second of three places, and of a
+    plate that passes across the first one alone, at a height above the middle.
+    """
+    belief = boxes_along_x(-0.6, 0.0, 0.6)
+    around, plate = (trimesh.creation.box(sides) for sides in ((0.5, 0.5, 0.5), (0.02, 0.3, 0.3)))
+    at = TILTED @ shifted(np.array([[-0.65, 0.0, 0.02], [0.0, 0.0, 0.0], [0.3, 0.0, 0.0]]))
+    assert belief.collision_chance(around, at[1:2]).chance == [pytest.approx(1 / 3)]
+    assert belief.collision_chance(plate, at[:1]).chance == [pytest.approx(1 / 3)]
+    assert belief.collision_chance(plate, at[2:]).chance == [0.0]
+    assert belief.collision_chance(plate, at).chance == [pytest.approx(2 / 3)]
+
+
+def test_the_best_grasp_is_that_of_any_member_and_moves_with_the_object():
+    """Without modes, between the places at 0.25 and 0.30 m a grasp holds two boxes of three."""
+    belief = boxes_along_x(0.0, 0.25, 0.30, verdict="wide")
+    down = compose(np.diag([1.0, -1.0, -1.0]), np.array([0.02, 0.0, 0.01]))
+    world, chance = belief.best_grasp(down[None], 0.07)
+    assert chance == pytest.approx(2 / 3)
+    expected = TILTED @ shifted(np.array([[0.25, 0.0, 0.0], [0.30, 0.0, 0.0]])) @ down
+    assert np.abs(expected - world).max(axis=(1, 2)).min() < 1e-9
+    assert belief.grasp_chance(world[None], 0.07).chance == [pytest.approx(2 / 3)]
+
+
+def test_fingers_reach_back_from_their_tips():
+    """Around a post on a plate, tips just above the plate are free, and those within it are not."""
+    post = trimesh.creation.box(bounds=[[-0.02, -0.02, 0.0], [0.02, 0.02, 0.08]])
+    plate = trimesh.creation.box(bounds=[[-0.08, -0.08, -0.02], [0.08, 0.08, 0.0]])
+    grid = SdfGrid.from_mesh(trimesh.boolean.union([post, plate], engine="manifold"), 0.005)
+    belief = PoseBelief(grid, result(TILTED[None]))
+    tips = shifted(np.array([[0.0, 0.0, 0.004], [0.0, 0.0, -0.004]]))
+    poses = TILTED @ tips @ compose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    assert belief.grasp_chance(poses, 0.06).chance.tolist() == [1.0, 0.0]
+
+
+def test_shifts_and_turns_of_one_sign_have_a_covariance_above_zero():
+    """Members that are farther along x are turned more about z, in world axes."""
+    steps = np.zeros((21, 6))
+    steps[:, 0] = np.linspace(-0.01, 0.01, 21)
+    steps[:, 5] = np.linspace(-0.1, 0.1, 21)
+    order = np.argsort(np.abs(steps[:, 0]), kind="stable")
+    steps = steps[order]  # the middle one is the best
+    symmetry = object_symmetry(L_SHAPE)
+    about = TILTED @ compose(np.eye(3), -symmetry.centre)
+    # Turned about the centre, which then moves by the shift alone.
+    turns = rotation_vector(steps[:, 3:]) @ about[:3, :3]
+    centre = about[:3, :3] @ symmetry.centre + about[:3, 3]
+    poses = compose(turns, centre + steps[:, :3] - turns @ symmetry.centre)
+    (mode,) = PoseBelief(L_GRID, result(poses, verdict="determined"), symmetry).modes
+    expected = (steps[:, :, None] * steps[:, None]).mean(axis=0)
+    np.testing.assert_allclose(mode.covariance, expected, atol=1e-9)
+    assert mode.covariance[0, 5] > 1e-4
+
+
+def test_a_half_turn_about_an_axis_of_the_object_is_none_of_a_tilted_box():
+    symmetry = object_symmetry(BOX)
+    turns = compose(axis_angle(np.eye(3), np.full(3, math.pi)), np.zeros((3, 3)))
+    poses = TILTED @ np.concatenate([np.eye(4)[None], turns])
+    (mode,) = PoseBelief(GRID, result(poses, verdict="determined"), symmetry).modes
+    assert np.abs(mode.covariance).max() < 1e-8

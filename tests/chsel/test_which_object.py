@@ -1,14 +1,23 @@
-"""Which of several objects is touched: rows, refusals, and the next action."""
+"""Which of several objects it is: energies, what all of them share, and the next probe."""
 
 import numpy as np
 import pytest
 import trimesh
 
 import chsel
-from chsel.problem.poses import apply
+from chsel.problem.noise import noise_model
+from chsel.problem.poses import apply, compose, inverse
 from replay.comparing.verification import EQUAL, verify
 from replay.mcap.reader import read_recording
-from tests.chsel.methods.scene import BOX, BOX_SIDES, TRUTH, WORKSPACE, on_faces
+from tests.chsel.methods.scene import (
+    BOX,
+    BOX_SIDES,
+    STANDING,
+    TRUTH,
+    WORKSPACE,
+    on_faces,
+)
+from tests.chsel.samples import Scripted, box_distance, plain_energy
 
 
 def test_the_true_object_comes_first(tmp_path):
@@ -52,13 +61,18 @@ def test_what_one_object_cannot_have_is_added_to_none():
 
 
 def test_objects_of_other_sizes_are_compared_by_the_same_points():
-    small, large = BOX.copy().apply_scale(0.2), BOX
+    """Touches 2.9 mm apart are one place of an object of 0.25 m, and two of one of 0.05 m."""
+    small = BOX.copy().apply_scale(0.2)
     contacts = apply(TRUTH, on_faces(12))
-    near = np.concatenate([contacts, contacts + np.array([0.0, 0.0, 0.0025])])
-    with chsel.WhichObject({"large": large, "small": small}) as which:
+    near = np.concatenate([contacts, contacts + np.array([0.0, 0.0, 0.0029])])
+    with chsel.WhichObject({"large": BOX, "small": small}, resolution=0.004) as which:
         which.add(contacts=near)
-        digests = {session.points.digest for session in which.sessions.values()}
-    assert len(digests) == 1
+        known = {name: session.points for name, session in which.sessions.items()}
+    assert len({points.digest for points in known.values()}) == 1
+    assert len(known["large"].known) == 24
+    with chsel.Session(BOX, resolution=0.01) as alone:
+        alone.add(contacts=near)
+        assert len(alone.points.known) == 12
 
 
 def test_no_action_is_chosen_by_two_objects():
@@ -78,3 +92,58 @@ def test_no_action_is_chosen_by_two_objects():
         assert which.sessions[names[1]].stop == "actions"
         with pytest.raises(chsel.ChselError, match=r"without is \[2\]; accepted: indices below 1"):
             which.sessions[names[0]].next_probe(one, without=[2])
+
+
+SLIM = BOX_SIDES * [1.0, 0.8, 1.0]  # 12 mm off on both wide sides
+
+
+@pytest.mark.parametrize("moves", [0.01, 0.0])
+def test_energies_are_those_of_the_points_where_the_object_is_now(moves):
+    """Each of eight touches of a side moves the box by 5 mm, straight away from the hand."""
+    distance = 0.5 * moves
+    pin = trimesh.creation.box(bounds=[[-2e-3, -2e-3, -0.02], [2e-3, 2e-3, 0.0]])
+    local = on_faces(12)[np.arange(12) % 3 < 2]
+    axis, now = np.tile([0, 1], 4), STANDING.copy()
+    noise, method = 0.002, Scripted([inverse(STANDING[None])], 0.002, distance)
+    meshes = {"slim": trimesh.creation.box(SLIM), "box": BOX}
+    given = {"workspace": WORKSPACE, "moves": moves, "method": method, "noise": noise}
+    ways = -np.sign(local[np.arange(8), axis])[:, None] * STANDING[:3, axis].T
+    now[:3, 3] -= distance * ways.sum(axis=0)  # at STANDING after the last touch
+    with chsel.WhichObject(meshes, **given) as which:
+        for touched, way in zip(local, ways, strict=True):
+            contact = apply(now, touched[None])[0]
+            turn = np.stack([np.cross([0.0, 0.0, 1.0], way), [0.0, 0.0, 1.0], way], axis=1)
+            turn[:, 0] = np.cross(turn[:, 1], way)
+            end = compose(turn, contact - 1e-3 * way)
+            which.add(hand=pin, path=end[None], contact=contact)
+            now[:3, 3] += distance * way
+        found = which.register()
+    assert [one.name for one in found] == ["box", "slim"]
+    for one, sides in zip(found, (BOX_SIDES, SLIM), strict=True):
+        residuals = box_distance(local, sides)
+        expected = plain_energy(noise_model(noise), residuals.tolist(), [])
+        assert one.energy == pytest.approx(expected, abs=0.02)
+
+
+def test_the_next_probe_forecasts_contacts_on_the_likeliest_object():
+    meshes = {"slim": trimesh.creation.box(SLIM), "box": BOX}
+    finger = trimesh.creation.box(bounds=[[-0.01, -0.01, -0.1], [0.01, 0.01, 0.0]])
+    method = Scripted([inverse(TRUTH[None])])
+    policy = chsel.build_policy("hit_chance", {"stop": {"spread": 0.0, "gain": 0.0}})
+    given = {"hand": finger, "workspace": WORKSPACE, "method": method, "policy": policy}
+    for sides in (BOX_SIDES, SLIM):
+        local = on_faces(24)
+        local[1::3, 1] *= sides[1] / BOX_SIDES[1]
+        with chsel.WhichObject(meshes, **given) as which:
+            which.add(contacts=apply(TRUTH, local))
+            which.register()
+            # Across the middles of the wide sides, where both objects are met, 12 mm apart.
+            along = TRUTH[:3, 1]
+            across = TRUTH[:3, 0]
+            turn = np.stack([across, np.cross(along, across), along], axis=1)
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = turn, TRUTH[:3, 3] - 0.2 * along
+            probe = which.next_probe(chsel.Actions(pose[None], [0.4]))
+        met = apply(inverse(TRUTH), probe.decision.contacts)
+        assert len(met) > 0
+        np.testing.assert_allclose(met[:, 1], -0.5 * sides[1], atol=0.002)

@@ -14,6 +14,7 @@ from rerun.chunk import RrdReader
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.errors import EngineError, RecordingError, SettingError
+from chsel.events import Probe
 from chsel.methods import build_method
 from chsel.plausible.plausible_set import plausible_set, save_plausible
 from chsel.plausible.plausible_settings import plausible_settings
@@ -101,6 +102,29 @@ def test_all_sets_are_judged_by_the_recorded_cost(path):
     assert any(o.numbers["best_cost"] != o.hypotheses.cost[0] for o in own)
     assert {o.as_recorded for o in outcomes if o.label == "chsel"} == {True}
     assert {o.as_recorded for o in outcomes if o.label != "chsel"} == {None}
+
+
+def test_errors_are_those_to_the_pose_that_a_push_has_left_the_object_in(path, tmp_path):
+    """The second probe has moved the box by 3 cm, as recordings say where it is known."""
+    events = list(read_recording(path).events())
+    moved = np.eye(4)
+    moved[:3, 3] = np.add(OFFSET, [0.0, 0.03, 0.0])
+    of_second = {"world_from_object": moved}
+    changed = [
+        dataclasses.replace(e, **of_second) if isinstance(e, Probe) and e.step == 1 else e
+        for e in events
+    ]
+    write_recording(tmp_path / "pushed.mcap", changed)
+    recording = read_recording(tmp_path / "pushed.mcap")
+    cost = common_cost(recording)
+    methods = chosen(recording, METHOD, ["chsel"])
+    for outcome in compared(recording, methods, recording.steps, cost):
+        poses = outcome.hypotheses.object_from_world
+        costs = CompiledCost.of(recording.problem(outcome.step), cost.settings).evaluate(poses)
+        best = np.linalg.inv(poses[np.argmin(costs)])
+        there = moved[:3, 3] if outcome.step == 1 else np.array(OFFSET)
+        error = np.linalg.norm(best[:3, 3] - there)
+        assert outcome.numbers["best_position_error"] == pytest.approx(error, abs=1e-12)
 
 
 def test_another_result_than_recorded_is_told(path, capsys, monkeypatch):

@@ -152,18 +152,20 @@ def test_decisions_are_exported_in_three_forms(steered_events, write, tmp_path):
         assert same_bits(arrays[f"step_{event.step}/poses"], event.problem.belief.object_from_world)
 
 
-def test_a_decision_on_other_actions_is_exported_with_theirs(steered_events, write, tmp_path):
-    """As of a program that offers new actions at each step, more of them, and turned hands."""
+@pytest.mark.parametrize("more", [2, 0])
+def test_a_decision_on_other_actions_is_exported_with_theirs(steered_events, write, tmp_path, more):
+    """As of a program that offers new actions at each step, and turned hands."""
     old = decided(steered_events, 1)
+    count = len(old.problem.actions) + more
     ten = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(1.1)), np.array([0.3, 0.2, 0.1]))
-    poses = np.tile(ten, (6, 1, 1))
-    poses[:, 0, 3] += 0.1 * np.arange(6)
-    others = Actions(poses, np.linspace(0.1, 0.2, 6))
-    scores = {name: np.full(6, 0.25) for name in ("score", "hit_chance", "blocked_chance")}
+    poses = np.tile(ten, (count, 1, 1))
+    poses[:, 0, 3] += 0.1 * np.arange(count)
+    others = Actions(poses, np.linspace(0.1, 0.2, count))
+    scores = {name: np.full(count, 0.25) for name in ("score", "hit_chance", "blocked_chance")}
     decision = dataclasses.replace(
-        old.decision, chosen=5, **scores, expected_spread=np.full(6, 0.01)
+        old.decision, chosen=3, **scores, expected_spread=np.full(count, 0.01)
     )
-    problem = dataclasses.replace(old.problem, actions=others, available=np.ones(6, dtype=bool))
+    problem = dataclasses.replace(old.problem, actions=others, available=np.ones(count, dtype=bool))
     new = dataclasses.replace(old, problem=problem, decision=decision)
     offered = ActionsOffered(1, others, nth(steered_events, ActionsOffered).hand)
     place = steered_events.index(old)
@@ -175,8 +177,8 @@ def test_a_decision_on_other_actions_is_exported_with_theirs(steered_events, wri
     rows = list(csv.DictReader((tmp_path / "out.csv").open(newline="")))
     start, along = ([float(rows[-1][name]) for name in names] for names in ("xyz", _ALONG))
     forward = ten @ [0.0, 0.0, 1.0, 0.0]
-    assert (int(rows[-1]["step"]), int(rows[-1]["chosen"])) == (1, 5)
-    assert start == pytest.approx([0.8, 0.2, 0.1], abs=1e-15)
+    assert (int(rows[-1]["step"]), int(rows[-1]["chosen"])) == (1, 3)
+    assert start == pytest.approx([0.6, 0.2, 0.1], abs=1e-15)
     assert along == pytest.approx(forward[:3], abs=1e-15)
     arrays = np.load(tmp_path / "out.npz")
     first = nth(steered_events, ActionsOffered).actions

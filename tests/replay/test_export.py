@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,15 +12,27 @@ import numpy as np
 import pytest
 
 from chsel.errors import SettingError
-from chsel.events import Believed, HypothesesFound, Measured, SensorImage, SnapshotTaken
+from chsel.events import (
+    Believed,
+    HypothesesFound,
+    Measured,
+    Probe,
+    ProblemPosed,
+    SensorImage,
+    SnapshotTaken,
+)
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import object_grid
+from chsel.problem.streams import StreamKey
 from replay.__main__ import main
 from replay.mcap.reader import read_recording
 from replay.verbs.export import EXPORTS, exported_archive, exported_modes
 from runners.sessions.points import PointsSession, PointsSettings
-from tests.chsel.samples import REPOSITORY
+from tests.chsel.samples import REPOSITORY, box_with_knob, hypotheses_at
 from tests.replay.conftest import same_bits
+from tests.tools.small_recordings import registered_session
 
 
 @pytest.fixture
@@ -125,6 +138,25 @@ def test_modes_of_a_recording_without_beliefs_are_those_of_its_results():
         assert same_bits(best, recording.hypotheses(step).object_from_world[0])
     alone = exported_modes(recording, "11").table
     assert alone.equals(steps.get_group(11))  # numbers follow from the steps before
+
+
+def test_a_mode_keeps_its_number_where_it_is_second_at_one_step_and_first_at_the_next(write):
+    """No contact has shown the knob of a box; turned by pi about its axis it fits as well."""
+    body, contacts = box_with_knob([0.1, 0.06, 0.08])
+    start = replace(registered_session("gradient_descent")[0], mesh=body, sdf=object_grid(body))
+    first, second = np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])
+    points, around = KnownPoints(known=contacts), (start.workspace, start.free_resolution)
+    events, known = [replace(start, initial_points=KnownPoints())], [points, KnownPoints()]
+    for step, poses in enumerate(([first, second], [second, first])):
+        key = StreamKey(start.seed, step)
+        problem = RegistrationProblem(start.sdf, points, np.stack(poses), *around, key)
+        found = hypotheses_at(np.stack(poses))
+        events += [Probe(step, "points", known[step]), ProblemPosed(step, problem)]
+        events.append(HypothesesFound(step, found))
+    modes = exported_modes(read_recording(write(events)), None).table
+    assert modes["number"].tolist() == [0, 1, 1, 0]
+    assert modes["m00"].tolist() == [1.0, -1.0, -1.0, 1.0]
+    assert modes["weight"].tolist() == [0.5] * 4
 
 
 def test_positions_and_quaternions_turn_the_object_into_the_world(recording):

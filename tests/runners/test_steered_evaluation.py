@@ -72,7 +72,9 @@ def test_every_probe_has_a_row_that_the_recording_confirms(folder):
             assert row["digest"] == recording.hypotheses(row["step"]).digest
             assert row["problem_digest"] == recording.problem(row["step"]).digest
             found = recording.hypotheses(row["step"]).object_from_world
-            assert row["error"] == pytest.approx(mean_error(recording.start, found).mean())
+            errors = mean_error(recording.start, found)
+            assert row["error"] == pytest.approx(errors.mean())
+            assert row["best_error"] == pytest.approx(errors[0])
         else:
             assert (row["digest"], row["seconds"], row["grasp_chance"]) == (None, None, None)
             assert row["error"] == row["belief_error"]
@@ -142,6 +144,8 @@ def test_the_middle_of_the_members_has_the_true_pose_or_not():
     for place, middles in (
         ([0.11, 0.05, 0.2], (1, 1)),
         ([0.11, 0.09, 0.2], (2 / 3, 1)),
+        ([0.11, 0.093, 0.2], (2 / 3, 1)),  # as far as between the last two of eleven places
+        ([0.11, 0.101, 0.2], (2 / 3, 2 / 3)),
         ([0.11, 0.09, 0.6], (1 / 3, 2 / 3)),
         ([0.3, 0.2, 0.6], (0, 0)),
     ):

@@ -31,7 +31,6 @@ from chsel.problem.registration_problem import (
 )
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import PlaneSettings, search_space
-from chsel.problem.streams import StreamKey
 from chsel.problem.subset import surface_descriptors
 from chsel.problem.surface import outline_distances_to
 from chsel.problem.trust import trust_in
@@ -96,12 +95,6 @@ def assert_found(found):
     position, rotation = pose_errors(found.object_from_world[:1], TRUTH, ObjectSymmetry())
     assert position[0] < 0.005
     assert rotation[0] < 0.05
-
-
-def test_results_depend_on_the_seed():
-    method = anchored()
-    other = posed(method, key=StreamKey(4, 1))
-    assert method.register(other).digest != method.register(posed(method)).digest
 
 
 @pytest.mark.parametrize("name", ODD)
@@ -190,10 +183,27 @@ def test_the_archive_leads_on_to_the_next_step():
 
 
 def test_a_good_pose_of_the_last_step_is_not_lost():
-    """Even if hardly any samples are drawn."""
-    method = anchored(replace(EFFORT, samples=10))
+    """It is in E_l alone, and nothing else is searched: a sample, without a fit."""
+    few = Effort(
+        samples=1,
+        kept=1,
+        first_steps=0,
+        refined=1,
+        steps=0,
+        descents=1,
+        descent_moves=1,
+        chains=1,
+        moves=1,
+        polished=1,
+        polish_moves=1,
+        evaluations=0,
+    )
+    method = anchored(few)
     problem = posed(method, low_cost_set=inverse(TRUTH)[None])
-    assert_found(registered(method, problem))
+    assert_found(method.register(problem))
+    without = method.register(posed(method))
+    position, _ = pose_errors(without.object_from_world[:1], TRUTH, ObjectSymmetry())
+    assert position[0] > 0.02
 
 
 def test_as_many_hypotheses_come_as_are_wanted():

@@ -97,6 +97,18 @@ def test_energies_that_walks_carry_along_are_those_of_their_poses(points):
     assert np.abs(chains.kept - starts.numbers[:1]).max(axis=(0, 2)).min() > 1e-3
 
 
+def test_walks_on_an_oblique_plane_slide_on_it_and_turn_about_its_normal():
+    normal = np.array([0.48, 0.6, 0.64])
+    plane = PlaneSettings(axis=tuple(normal), offset=-0.4)
+    there = compose(np.eye(3), 0.4 * normal)  # world_from_object
+    energy = energy_of(KnownPoints(known=apply(there, on_faces(24))), noise_model(0.002))
+    found = Poses(chains_of(energy, repeated(there, 40), 50.0, 200, 3, plane).poses)
+    np.testing.assert_allclose(found.rotations @ normal, np.tile(normal, (40, 1)), atol=1e-12)
+    np.testing.assert_allclose(found.translations @ normal, -0.4, atol=1e-12)
+    assert found.translations.std(axis=0).min() > 1e-4
+    assert rotation_angle(found.rotations).std() > 1e-3
+
+
 def test_walks_from_above_come_down_to_a_floor_and_stop():
     energy, starts = energy_of(AROUND, noise_model(0.0005)), poses_around_truth(12, 0.02, 0.2)
     before = energy.of(starts)
@@ -132,33 +144,58 @@ AT_ODDS = KnownPoints(
 """Known points off by 1 mm, one on another object, and free and occupied voxels that are wrong."""
 
 
+MANY_AT_ODDS = KnownPoints(
+    free=AT_ODDS.free,
+    occupied=AT_ODDS.occupied,
+    known=np.concatenate([AT_ODDS.known[:24]] * 3 + [AT_ODDS.known[24:]])
+    + 0.001 * np.random.default_rng(2).normal(size=(73, 3)),
+    known_sdf=[*HEIGHTS, *HEIGHTS, *HEIGHTS, 0.0],
+)
+"""The same with 73 known points, of which the energy counts 30."""
+
+
 def off_truth(poses):
     """Metres and radians (B,)."""
     off = Poses.of(poses.matrices @ TRUTH)
     return np.sqrt((off.translations**2).sum(axis=1)), rotation_angle(off.rotations)
 
 
-def test_a_fit_ends_where_no_motion_lowers_the_plain_formula():
+@pytest.mark.parametrize("points", [AT_ODDS, MANY_AT_ODDS], ids=["25", "73"])
+def test_a_fit_ends_where_no_motion_lowers_the_plain_formula(points):
     """Points of all classes disagree there, so that each must have its weight and its sign."""
     poses = poses_around_truth(6, 0.01, 0.1)
-    found = fitted(energy_of(AT_ODDS, NOISE), TWISTS, poses, 60)
-    before = plain_energies(NOISE, BOX_GRID, AT_ODDS, poses)
-    after = plain_energies(NOISE, BOX_GRID, AT_ODDS, found)
+    found = fitted(energy_of(points, NOISE), TWISTS, poses, 60)
+    before = plain_energies(NOISE, BOX_GRID, points, poses)
+    after = plain_energies(NOISE, BOX_GRID, points, found)
     assert (after < before - 10.0).all()
 
     def moved(twist):
         angle = np.sqrt((twist[:3] ** 2).sum())
         turn = axis_angle(twist[:3] / max(angle, 1e-9), angle / 0.1)
         pose = Poses.of((compose(turn, twist[3:]) @ found.matrices[0])[None])
-        return float(plain_energies(NOISE, BOX_GRID, AT_ODDS, pose)[0])
+        return float(plain_energies(NOISE, BOX_GRID, points, pose)[0])
 
     options = {"xtol": 1e-5, "ftol": 1e-6, "direc": 1e-3 * np.eye(6)}
     least = minimize(moved, np.zeros(6), method="Powell", options=options)
     assert least.nfev > 60
     assert after[0] - least.fun < 0.01
-    known = BOX_GRID.at(apply(found.matrices[0], AT_ODDS.known), lookup="trilinear")[0]
-    assert np.abs(known[:24] - HEIGHTS).max() < 0.006
-    assert abs(known[24] - 0.03) < 0.002  # the foreign contact moves nothing
+    known = BOX_GRID.at(apply(found.matrices[0], points.known), lookup="trilinear")[0]
+    assert np.abs(known - points.sdf)[:-1].max() < 0.006
+    assert abs(known[-1] - 0.03) < 0.003  # the foreign contact moves nothing
+
+
+def test_a_fit_that_goes_far_counts_free_points_that_were_not_near_at_first():
+    """Contacts draw the box by 36 mm onto free points that were 26 mm in front of it."""
+    rough = NoiseModel((0.015,) * LEVELS, (1.0 / LEVELS,) * LEVELS, softness=0.01, wrong=50.0)
+    random = np.random.default_rng(0).uniform(-0.8, 0.8, (300, 2))
+    ahead = np.column_stack([np.full(300, X - 0.01), random * [Y, Z]])
+    points = KnownPoints(known=apply(TRUTH, on_faces(24)), free=apply(TRUTH, ahead))
+    start = poses_of(turned(0.0, -0.036))
+    found = fitted(energy_of(points, rough), TWISTS, start, 30)
+    before, after = (plain_energies(rough, BOX_GRID, points, p)[0] for p in (start, found))
+    there = plain_energies(rough, BOX_GRID, points, poses_of(TRUTH))[0]
+    assert there > before + 20.0
+    assert after <= before
 
 
 def test_fits_by_rough_then_exact_noise_come_from_afar():

@@ -17,6 +17,7 @@ from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, check_rigid, inverse
 from chsel.problem.settings import PRESETS, settings_mapping
 from chsel.problem.streams import StreamKey
+from tests.chsel.laws import every_method, quick
 from tests.chsel.methods.scene import (
     ODD,
     STANDING,
@@ -27,26 +28,10 @@ from tests.chsel.methods.scene import (
 )
 
 FEW = known_points(TRUTH, 12)
-QUICK = {
-    "descent": {"restarts": 2, "iterations": 15},
-    "emitter": {"iterations": 6},
-    "cma_es": {"generations": 15},
-}
 WITH_ARCHIVE = [name for name in METHODS if hasattr(preset_settings(name), "emitter")]
 PLANAR = [name for name in METHODS if hasattr(preset_settings(name), "plane")]
 WITH_STARTS_NEARBY = ("icp", "svgd", "cvo", "cvo_no_free_space")
 """Methods that find a pose from starts nearby alone."""
-
-
-def quick(name, preset="default", **changes):
-    settings = settings_mapping(preset_settings(name, preset))
-    for group in QUICK.keys() & settings.keys():
-        settings[group] |= QUICK[group]
-    for count in {"iterations", "max_iterations"} & settings.keys():
-        settings[count] = 8
-    if name == "anchored":
-        settings["size"] = "small"
-    return build_method(name, settings | changes)
 
 
 def judged(method, problem, poses):
@@ -80,8 +65,7 @@ def test_a_method_finds_the_pose_of_an_object_touched_all_over(name):
     assert_found(method.register(problem), TRUTH)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", METHODS)
+@every_method
 def test_results_are_whole_and_neither_observers_nor_threads_change_a_bit(name, preset):
     method = quick(name, preset)
     problem = posed(method, FEW)

@@ -261,3 +261,15 @@ def test_files_that_cannot_be_read_say_what_to_do(tmp_path, file_name, content, 
     (tmp_path / file_name).write_bytes(content)
     with pytest.raises(MeshError, match=f"{file_name} .*{message}"):
         load_mesh(tmp_path / file_name)
+
+
+def test_of_more_than_a_thousand_bodies_the_large_ones_are_compared():
+    """Two boxes 1 m apart, and 1200 splinters on one of them, which alone are near each other."""
+    corners = np.array(CORNERS) * 0.001
+    offsets = np.random.default_rng(0).uniform(-0.05, 0.05, (1200, 3))
+    splinters = (corners + offsets[:, None]).reshape(-1, 3)
+    faces = (np.array(TETRAHEDRON) + 4 * np.arange(1200)[:, None, None]).reshape(-1, 3)
+    parts = [BOX, moved(BOX, 0.0, 1.2, 0.0), trimesh.Trimesh(splinters, faces, process=False)]
+    (warning,) = check_bodies(trimesh.util.concatenate(parts), "dust")
+    assert warning.code == "bodies_apart"
+    assert "dust has 2 bodies at least 1 m apart" in warning.text

@@ -5,6 +5,7 @@ import io
 import json
 import struct
 
+import numpy as np
 import pytest
 import trimesh
 from hypothesis import HealthCheck, given, settings
@@ -24,6 +25,8 @@ from chsel.events import (
     SnapshotTaken,
     Traced,
 )
+from chsel.next_probe.decision_problem import Actions
+from chsel.problem.poses import axis_angle, compose
 from chsel.problem.sdf_grid import object_grid
 from chsel.session.session import Session
 from replay.__main__ import main
@@ -163,6 +166,29 @@ def test_decisions_without_their_actions_are_lost(tmp_path, steered_events):
     kept, found = recovered(tmp_path, flipped(data, *chunks_of(data, "/probe")[1]))
     assert [event.step for event in kept if isinstance(event, Decided)] == [-1, 0]
     assert {"/decision of step 1", "/decision of step 2"} <= set(found.lost)
+
+
+def test_each_decision_comes_back_on_the_actions_that_were_offered_last(tmp_path, steered_events):
+    """Others are offered before the second decision, and the end of the file is cut off."""
+    first = nth(steered_events, ActionsOffered)
+    second, place = nth(steered_events, Decided, 1), 0
+    turn = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(1.1)), np.array([0.3, 0.2, 0.1]))
+    others = Actions(turn @ first.actions.world_from_hand, first.actions.length + 0.1)
+    offered = dataclasses.replace(first, step=second.step, actions=others)
+    events = []
+    for event in steered_events:
+        if event is second:
+            place = len(events)
+            events.append(offered)
+        if place and isinstance(event, Decided):
+            problem = dataclasses.replace(event.problem, actions=others)
+            event = dataclasses.replace(event, problem=problem)
+        events.append(event)
+    data = recorded(tmp_path / "whole.mcap", events, Decided)
+    kept, _ = recovered(tmp_path, data[: chunks_of(data, "/decision")[-1][0] + 40])
+    digests = [e.problem.actions.digest for e in kept if isinstance(e, Decided)]
+    assert digests == [first.actions.digest] + [others.digest] * (len(digests) - 1)
+    assert len(digests) == 3
 
 
 def test_verify_does_not_judge_by_what_is_lost(tmp_path):

@@ -223,6 +223,23 @@ def test_surface_points_are_the_boxes_front_without_its_outline(tmp_path):
         np.testing.assert_array_equal(points_of(flat, chosen).surface, expected)
 
 
+def test_a_label_that_reaches_the_border_of_the_image_keeps_its_pixels_there(tmp_path):
+    """Nothing else is beside it there: the object goes on outside of the image."""
+    frame = read_depth_frame(written(tmp_path))
+    label = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    label[40:, 60:] = True
+    flat = dataclasses.replace(frame, depth=np.full_like(frame.depth, FRONT), label=label)
+    expected = np.zeros_like(label)
+    expected[42:, 62:] = True  # two pixels within the outline
+    found = points_of(flat)
+    np.testing.assert_array_equal(found.surface, expected)
+    assert found.labelled.outline == label.sum() - expected.sum()
+    assert found.labelled.invalid == found.labelled.edges == 0
+    none = flat.depth.copy()
+    none[50:, 70:] = none[:5, :5] = 0.0
+    assert points_of(dataclasses.replace(flat, depth=none)).labelled.invalid == 10 * 10
+
+
 @pytest.mark.parametrize(
     ("blob", "depth", "kept", "reason"),
     [
