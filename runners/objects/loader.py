@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Protocol
 
 import numpy as np
 
@@ -69,29 +69,41 @@ OBJECTS = {name: ObjectConfig(name, *trial) for name, trial in _TRIALS.items()} 
 PAPER_RESOLUTION = 0.010  # m: of the SDF grids of these in the paper's simulated trials
 
 
+class GridSettings(Protocol):
+    """Settings of a source for which the object is loaded."""
+
+    @property
+    def object_resolution(self) -> float | None:
+        """Spacing of the object's SDF grid, metres; None: by the object."""
+
+    @property
+    def object_padding(self) -> float:
+        """Padding of the object's SDF grid, metres."""
+
+
 @dataclass(frozen=True, eq=False)
 class ObjectModel:
-    """An object as a session sees it: its mesh in metres, with the scale already applied."""
+    """An object as a source sees it: its mesh in metres, with the scale already applied."""
 
-    name: str
-    mesh: trimesh.Trimesh
-    scale: float
-    epsilon: float
-    configuration: str
+    name: str  # as its choice is called
+    mesh: trimesh.Trimesh  # in its own frame, metres
+    scale: float  # applied to the mesh
+    epsilon: float  # tolerance of the plausible set, metres
+    configuration: str  # by which simulated sources place and probe it, unless settings name one
     of_paper: bool = False  # one of the paper's simulated trials, at its scale there
     _grids: dict[tuple[float | None, float], SdfGrid] = field(default_factory=dict, repr=False)
 
-    def resolution(self, settings: Any) -> float | None:
-        """Spacing in metres of the SDF grid that a session's settings ask for.
+    def resolution(self, settings: GridSettings) -> float | None:
+        """Return the spacing in metres of the SDF grid that settings ask for.
 
         Where they leave it open, an object of the paper's trials has that of the paper, and every
         other that of `object_grid`, which None stands for.
         """
-        chosen: float | None = settings.object_resolution
+        chosen = settings.object_resolution
         return PAPER_RESOLUTION if chosen is None and self.of_paper else chosen
 
-    def grid(self, settings: Any) -> SdfGrid:
-        """The signed distance grid that a session's settings ask for, made once."""
+    def grid(self, settings: GridSettings) -> SdfGrid:
+        """Return the signed distance grid that settings ask for, made once."""
         resolution, padding = self.resolution(settings), settings.object_padding
         if (resolution, padding) not in self._grids:
             grid = object_grid(self.mesh, resolution, padding=padding)

@@ -57,7 +57,7 @@ class Engine(Protocol):
         """End the world. Ending twice is ending once."""
 
 
-class Gripper:
+class SimulatedGripper:
     """The hand's control: proportional, noisy, in control steps of MINI_STEPS mini-steps."""
 
     def __init__(self, engine: Engine, settings: ProbingSettings, seed: int) -> None:

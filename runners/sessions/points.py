@@ -1,4 +1,4 @@
-"""A session whose known points come from a file."""
+"""A source whose known points come from a file."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from chsel.errors import (
 )
 from chsel.events import Probe
 from chsel.numerics.arrays import FloatArray, IntArray, frozen, read_npz, refuse_special_file
+from chsel.problem.online_registration import Start
 from chsel.problem.points import (
     FREE_RESOLUTION,
     KnownPoints,
@@ -38,6 +39,7 @@ from chsel.problem.poses import nearest_rigid
 from chsel.problem.sdf_grid import OBJECT_PADDING
 from chsel.problem.streams import LAST_STEP
 from runners.objects.loader import ObjectModel
+from runners.sessions.source import ObjectOrigin, ProbeSource, SourceKind
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class PointsSettings:
             )
 
 
-class PointsSession:
+class PointsSource(ProbeSource):
     """Replays the steps of a file; a probe's index is the file's step; see `ProbeSource`.
 
     Raises PointsError for points that cannot be those of the object.
@@ -82,7 +84,8 @@ class PointsSession:
         self.world_from_object = self._file.world_from_object
         self.initial_points = KnownPoints()
         self.count = len(self._steps)
-        self.warnings: list[PointsWarning] = []  # about the file
+        self.start = Start(settings.start_contacts, settings.start_probe)
+        self.warnings: list[PointsWarning] = []
         self._points: list[KnownPoints] = []  # of each step
         every = KnownPoints()
         diameter = object_model.diameter
@@ -111,10 +114,21 @@ class PointsSession:
             yield Probe(step, "points", points, contacts=contacts, contact_normals=0.0 * contacts)
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Release nothing, as nothing is held open."""
 
 
-KINDS = ("surface", "free", "occupied", "known")
+def open_points(
+    settings: PointsSettings, object_model: ObjectModel | None, seed: int
+) -> PointsSource:
+    """Open the source of a file, whatever the seed. Raise PointsError for unusable points."""
+    assert object_model is not None
+    return PointsSource(settings, object_model)
+
+
+POINTS = SourceKind(PointsSettings, open_points, ObjectOrigin.REAL)
+
+
+CLASSES = ("surface", "free", "occupied", "known")
 _COLUMNS = ["x", "y", "z", "kind", "sdf", "step"]
 _ACCEPTED = "x, y, z[, kind[, sdf]][, step], commas between them, decimal points in numbers"
 
@@ -123,7 +137,7 @@ _ACCEPTED = "x, y, z[, kind[, sdf]][, step], commas between them, decimal points
 class PointFile:
     """The points of a file in its order, each with its kind, signed distance and step."""
 
-    kinds: np.ndarray  # (N,), of KINDS
+    kinds: np.ndarray  # (N,), of CLASSES
     points: FloatArray  # (N, 3), world, metres
     sdf: FloatArray  # (N,), metres; that of known points alone counts
     steps: IntArray  # (N,): at which each becomes known
@@ -132,7 +146,7 @@ class PointFile:
     def at(self, step: int) -> KnownPoints:
         """All that becomes known at a step; surface points are known points of distance 0."""
         surface, free, occupied, known = (
-            np.flatnonzero((self.kinds == kind) & (self.steps == step)) for kind in KINDS
+            np.flatnonzero((self.kinds == kind) & (self.steps == step)) for kind in CLASSES
         )
         known = np.concatenate([surface, known])
         points = self.points
@@ -167,11 +181,11 @@ def read_points(path: str | Path) -> PointFile:
 
 
 def _read_npz(path: Path) -> PointFile:
-    accepted = [*KINDS, "known_sdf", *(f"{kind}_step" for kind in KINDS), "world_from_object"]
+    accepted = [*CLASSES, "known_sdf", *(f"{kind}_step" for kind in CLASSES), "world_from_object"]
     arrays = read_npz(path, accepted=accepted, error=PointsError)
-    given = [kind for kind in KINDS if kind in arrays]
+    given = [kind for kind in CLASSES if kind in arrays]
     if not given:
-        raise PointsError(f"no array of points; accepted: at least one of {', '.join(KINDS)}")
+        raise PointsError(f"no array of points; accepted: at least one of {', '.join(CLASSES)}")
     if ("known" in arrays) != ("known_sdf" in arrays):
         raise PointsError("known and known_sdf stand only together")
     pose = arrays.get("world_from_object")
@@ -221,7 +235,7 @@ def _read_csv(path: Path) -> PointFile:
         raise PointsError(_not_a_number(table)) from None
     points, sdf, steps = numbers[:, :3], numbers[:, 3], numbers[:, 4]
     for wrong, what in (
-        (~np.isin(kinds, KINDS), f"kind is none of {', '.join(KINDS)}"),
+        (~np.isin(kinds, CLASSES), f"kind is none of {', '.join(CLASSES)}"),
         (~np.isfinite(numbers).all(axis=1), "one of x, y, z, sdf and step is not a finite number"),
         (known & ~given, "a known point needs an sdf"),
         (~known & (sdf != 0.0), "a point that is not known has an sdf"),

@@ -1,4 +1,4 @@
-"""A session that repeats the probes of an earlier recording, in its order or as actions."""
+"""A source that repeats the probes of an earlier recording, in its order or as actions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import PointsError, PoseError, SessionError, SettingError
-from chsel.events import Probe
+from chsel.events import Probe, SessionStarted
 from chsel.next_probe.action_lattice import ActionSettings, straight_actions
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
@@ -21,11 +21,11 @@ from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
 from chsel.sensing.free_space import interior_lattice, poses_between
 from replay.mcap.reader import read_recording
+from runners.objects.loader import ObjectModel
+from runners.sessions.probing import PROBING
 from runners.sessions.probing_hand import DescribedHand, open_hand
 from runners.sessions.probing_settings import ProbingSettings, expected_moves
-from runners.sessions.source import require_available
-
-_OF_GRIPPERS = ("simulated", "kinematic")  # sessions with a hand of ours
+from runners.sessions.source import ObjectOrigin, SourceKind, Steerable, require_available
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class RecordedSettings:
             raise SettingError("path is missing; pass session.path=FILE, a recording.mcap")
 
 
-class RecordedSession:
+class RecordedSource(Steerable):
     """Gives the probes of a recording, with every point as it was.
 
     Raises RecordingError for a file that is not one, PointsError for points that cannot be those of
@@ -52,9 +52,13 @@ class RecordedSession:
         assert settings.path is not None
         recording = read_recording(settings.path)
         start = recording.start
-        self._recording, self.recorded, self._probes = recording, start, recording.probes
-        self.workspace, self.free_resolution = start.workspace, start.free_resolution
-        self.world_from_object, self.initial_points = start.world_from_object, start.initial_points
+        self._recording = recording
+        self._probes = recording.probes
+        self.recorded: SessionStarted = start
+        self.workspace = start.workspace
+        self.free_resolution = start.free_resolution
+        self.world_from_object = start.world_from_object
+        self.initial_points = start.initial_points
         self.count = len(self._probes)
         self._config: Mapping[str, Any] = start.config.get("session", {})
         self.push_distance = expected_moves(self._config)
@@ -85,10 +89,10 @@ class RecordedSession:
             return self._recording.offered.hand
         if self._recording.rig is not None and self._recording.rig.hand is not None:
             return HandShape.of(self._recording.rig.hand)
-        if self.recorded.session not in _OF_GRIPPERS:
+        if self.recorded.session not in PROBING:
             raise SessionError(
                 f"recording {self._recording.path} does not describe the hand, so that its probes "
-                "cannot be chosen; accepted: a session of kind simulated or kinematic, or of "
+                f"cannot be chosen; accepted: a session of kind {' or '.join(PROBING)}, or of "
                 "sensors with solid parts of the hand in the rig"
             )
         described = build_settings(DescribedHand, self._config.get("hand", {}), "session.hand")
@@ -118,7 +122,7 @@ class RecordedSession:
     @cached_property
     def _actions(self) -> RecordedActions:
         hand, depth = self.hand, 0.0
-        if self.recorded.session in _OF_GRIPPERS:
+        if self.recorded.session in PROBING:
             depth = self._config.get("interior_depth", ProbingSettings.interior_depth)
         lattice = Lattice(self.workspace.lower, self.free_resolution)
         try:
@@ -147,7 +151,17 @@ class RecordedSession:
         return ((probe.step, probe.new_points, probe.push) for probe in self.probes())
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Release nothing, as nothing is held open."""
+
+
+def open_recorded(
+    settings: RecordedSettings, object_model: ObjectModel | None, seed: int
+) -> RecordedSource:
+    """Open the source of a recording, whatever the seed. Raise RecordingError if it is none."""
+    return RecordedSource(settings)
+
+
+RECORDED = SourceKind(RecordedSettings, open_recorded, ObjectOrigin.RECORDED)
 
 
 _ASIDE = 0.010  # m: from the line of a push, what is before it

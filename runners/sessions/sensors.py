@@ -1,4 +1,4 @@
-"""Sessions whose known points come from a robot's log, or from one depth image."""
+"""Sources whose known points come from a robot's log, or from one depth image."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from chsel.errors import SettingError
 from chsel.events import Logged, Probe, RigDescribed
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.online_registration import Start
 from chsel.problem.points import KnownPoints, check_points
 from chsel.problem.settings import CheckedSettings, not_negative, positive
 from replay.files import file_digest
@@ -35,7 +36,7 @@ from runners.sensors.rig import Rig
 from runners.sensors.second_pass import SecondPass
 from runners.sensors.session_report import LogWarnings, Report
 from runners.sessions.probing import box_shell
-from runners.sessions.source import ProbeEvent, ProbeSource
+from runners.sessions.source import ObjectOrigin, ProbeEvent, ProbeSource, SourceKind
 
 NO_POSE = "none"
 _FAR = 10.0  # m: from the world's origin, of no camera or object on or beside a table
@@ -68,18 +69,25 @@ class SensorsSettings(CheckedSettings):
             )
 
 
-def open_sensors(settings: SensorsSettings, object_model: ObjectModel, seed: int) -> ProbeSource:
-    """The session of a log, or of a depth image. Raises SessionError if it cannot be used."""
-    path = Path(settings.path or "").expanduser()
-    if path.suffix.lower() in FRAME_SUFFIXES:
-        resolution, images = settings.free_resolution, settings.images
-        return DepthFrameSession(
-            path, settings.rig, object_model, free_resolution=resolution, images=images
-        )
-    return SensorsSession(settings, seed, diameter=object_model.diameter)
+def open_sensors(
+    settings: SensorsSettings, object_model: ObjectModel | None, seed: int
+) -> ProbeSource:
+    """Open the source of a log, or of a depth image. Raise SessionError if it cannot be used."""
+    assert object_model is not None
+    if Path(settings.path or "").suffix.lower() in FRAME_SUFFIXES:
+        return DepthFrameSource(settings, object_model)
+    return SensorsSource(settings, seed, diameter=object_model.diameter)
 
 
-class SensorsSession:
+SENSORS = SourceKind(
+    SensorsSettings,
+    open_sensors,
+    ObjectOrigin.REAL,
+    groups=({"presets/rig@rig": "default"}, {"rig": "cabinet"}),
+)
+
+
+class SensorsSource(ProbeSource):
     """Reads a log twice: what is small at once, images one after the other; see `ProbeSource`."""
 
     def __init__(
@@ -91,9 +99,10 @@ class SensorsSession:
         """
         path = Path(settings.path or "").expanduser()
         rig = settings.rig
-        self.report = Report()
+        self.report: Report = Report()
         self.workspace = rig.box()
         self.free_resolution = settings.free_resolution
+        self.start = Start(settings.start_contacts, settings.start_probe)
         self.world_from_object: FloatArray | None = None
         self._rig, self._seed, self._images = rig, seed, settings.images
         self._diameter, self._opening = diameter, LogWarnings()
@@ -151,7 +160,7 @@ class SensorsSession:
         yield from (Logged(last, level, text) for level, text in self.report.lines)
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Release nothing, as nothing is held open."""
 
     def _find_pose(self, path: Path, chosen: str | None) -> None:
         """The true pose, if there is a file of it."""
@@ -171,31 +180,33 @@ class SensorsSession:
             self._opening.note(f"the true pose is that of {file.name}")
 
 
-class DepthFrameSession:
+class DepthFrameSource(ProbeSource):
     """The known points of a depth image as a single probe; see `ProbeSource`."""
 
-    def __init__(
-        self,
-        path: Path,
-        rig: Rig,
-        object_model: ObjectModel,
-        *,
-        free_resolution: float,
-        images: bool,
-    ) -> None:
-        self.report = Report()
-        self.free_resolution = free_resolution
+    def __init__(self, settings: SensorsSettings, object_model: ObjectModel) -> None:
+        self.report: Report = Report()
+        self.free_resolution = settings.free_resolution
         self.initial_points = KnownPoints()
         self.count = 1
-        self._rig, self._path, self._images = rig, path, images
-        self._frame = read_depth_frame(path)
-        diameter = object_model.diameter
+        self.start = Start(settings.start_contacts, settings.start_probe)
+        self._rig = settings.rig
+        self._path = Path(settings.path or "").expanduser()
+        self._images = settings.images
+        self._frame = read_depth_frame(self._path)
         self._points = depth_frame_points(
-            self._frame, rig, free_resolution=free_resolution, diameter=diameter
+            self._frame,
+            self._rig,
+            free_resolution=self.free_resolution,
+            diameter=object_model.diameter,
         )
         self.workspace = self._points.workspace
         self.world_from_object = self._frame.world_from_object
-        check_points(self._points.points, diameter, free_resolution, self.workspace)
+        check_points(
+            self._points.points,
+            object_model.diameter,
+            free_resolution=self.free_resolution,
+            workspace=self.workspace,
+        )
 
     def probes(self) -> Iterator[ProbeEvent]:
         """The image, and what follows from it."""
@@ -249,4 +260,4 @@ class DepthFrameSession:
             yield "warning", f"{outside} of {len(known)} surface points are out of the workspace"
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Release nothing, as nothing is held open."""

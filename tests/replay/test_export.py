@@ -17,7 +17,7 @@ from chsel.problem.poses import inverse
 from replay.__main__ import main
 from replay.mcap.reader import read_recording
 from replay.verbs.export import EXPORTS, exported_archive, exported_modes
-from runners.sessions.points import PointsSession, PointsSettings
+from runners.sessions.points import PointsSettings, PointsSource
 from tests.chsel.samples import REPOSITORY
 from tests.replay.conftest import same_bits
 
@@ -58,7 +58,7 @@ def test_a_points_session_on_exported_points_has_the_recorded_problems(recording
     path = exported(recording, "points", file_format)
     workspace = tuple(zip(*recording.start.workspace.bounds.tolist(), strict=True))
     large: Any = SimpleNamespace(diameter=5.0)
-    session = PointsSession(PointsSettings(str(path), workspace), large)
+    session = PointsSource(PointsSettings(str(path), workspace), large)
     assert session.workspace == recording.start.workspace
     points, steps = KnownPoints(), []
     for probe, original in zip(session.probes(), recording.probes, strict=True):

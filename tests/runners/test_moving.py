@@ -12,7 +12,7 @@ from replay.comparing.verification import EQUAL, verify
 from replay.mcap.reader import read_recording
 from runners import evaluate, probe
 from runners.sessions.placement import centre_of_mass
-from runners.sessions.recorded import RecordedSession, RecordedSettings
+from runners.sessions.recorded import RecordedSettings, RecordedSource
 from tests.runners.in_process import run
 
 MOVES = 0.01  # m
@@ -70,7 +70,7 @@ def test_recorded_problems_with_pushes_give_the_recorded_bits(recording):
     )
     verdicts = list(verify(recording))
     assert {verdict.outcome for verdict in verdicts} == {EQUAL}
-    session = RecordedSession(RecordedSettings(str(recording.path)))
+    session = RecordedSource(RecordedSettings(str(recording.path)))
     online = session.online(OnlineSettings(), recording.seed)
     posed = [step.problem for step in online.steps(session.perceived()) if step.problem]
     assert [p.pushes.digest for p in posed] == [
