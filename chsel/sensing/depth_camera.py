@@ -71,16 +71,9 @@ class PinholeCamera:
 
     @classmethod
     def of_matrix(cls, matrix: Any, width: int, height: int) -> PinholeCamera:
-        """The camera of a matrix (3, 3). Raises SettingError for one that is not a pinhole's."""
-        matrix = frozen("camera", matrix, (3, 3), error=SettingError)
-        fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        off = matrix - np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        if np.abs(off).max() > _MATRIX_ROUNDING * max(abs(fx), 1.0):
-            raise SettingError(
-                f"camera is {quoted(matrix.tolist())}, not a pinhole camera's matrix; accepted: "
-                "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] by rows, pixels"
-            )
-        return cls(width, height, fx, fy, cx, cy)
+        """Return the camera of a matrix (3, 3). Raise SettingError if it is not a pinhole's."""
+        fx, fy, cx, cy = matrix_numbers(matrix)
+        return cls(width, height, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def check_centre(self) -> list[InputWarning]:
         """A warning if the principal point is likely that of another image, or cx and cy swapped.
@@ -134,6 +127,27 @@ class PinholeCamera:
                 "camera"
             )
         return values
+
+
+def matrix_numbers(
+    matrix: Any, *, skew: float = _MATRIX_ROUNDING
+) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx and cy, pixels, of a camera's matrix (3, 3).
+
+    skew: the largest that is left out, of the focal length. Raise SettingError for a matrix that is
+    not a pinhole camera's.
+    """
+    matrix = frozen("camera", matrix, (3, 3), error=SettingError)
+    fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    off = np.abs(matrix - np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
+    most = np.full((3, 3), _MATRIX_ROUNDING)
+    most[0, 1] = skew
+    if (off > most * max(abs(fx), 1.0)).any():
+        raise SettingError(
+            f"camera is {quoted(matrix.tolist())}, not a pinhole camera's matrix; accepted: "
+            "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] by rows, pixels"
+        )
+    return fx, fy, cx, cy
 
 
 def valid_pixels(depth: FloatArray, *, nearest: float, furthest: float) -> BoolArray:

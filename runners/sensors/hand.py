@@ -25,23 +25,34 @@ from runners.sensors.session_report import Counts
 if TYPE_CHECKING:
     import trimesh
 
+HAND = "hand"
+"""Name under which the hand is counted."""
 MOST_POSES = 200  # of a probe's path, as it is shown
 _BATCH = 50_000  # poses looked up at once
 _MOVING = ("revolute", "continuous", "prismatic")
 
 
 class HandModel:
-    """The solids of a hand, read once, placed as often as joints move.
+    """The solids of a hand, read once, placed as often as joints move."""
 
-    joint_names: joints whose values move any of them. sliding: those of them that are prismatic.
-    warnings: what a user should know of how they were read. Raises SettingError for a URDF that
-    cannot be used.
-    """
+    frame: str
+    """Frame of the hand in the log."""
+
+    joint_names: tuple[str, ...]
+    """Joints whose values move any of the solids."""
+
+    sliding: frozenset[str]
+    """Those of the joints that are prismatic."""
+
+    warnings: list[str]
+    """Warnings of how the solids were read."""
 
     def __init__(self, rig: HandRig) -> None:
-        self.joint_names: tuple[str, ...] = ()
-        self.sliding: frozenset[str] = frozenset()
-        self.warnings: list[str] = []
+        """Read the solids. Raise SettingError for a URDF that cannot be used."""
+        self.frame = rig.frame
+        self.joint_names = ()
+        self.sliding = frozenset()
+        self.warnings = []
         self._boxes = [box_mesh(box) for box in rig.boxes]
         self._links: list[tuple[str, trimesh.Trimesh]] = []  # nodes of the scene, with their solids
         if rig.urdf is not None:

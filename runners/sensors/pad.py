@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import sqrt
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -22,10 +21,21 @@ from chsel.sensing.depth_camera import (
     valid_pixels,
 )
 from runners.sensors.cell import RobotCell
-from runners.sensors.depth_camera import View, metres, recorded_image, view_of
+from runners.sensors.depth_camera import (
+    View,
+    camera_of,
+    check_unit,
+    first_images,
+    image_topics,
+    metres,
+    recorded_image,
+    view_of,
+)
+from runners.sensors.first_pass import FirstPass
 from runners.sensors.log.images import read_image
 from runners.sensors.log.messages import ImageMessage
 from runners.sensors.rig import BubbleRig, ContactRig
+from runners.sensors.sensor import Sensed
 from runners.sensors.session_report import Counts
 
 REACH = 0.1  # m: of the membrane from its camera, for how far a turn moves it
@@ -70,19 +80,15 @@ def membrane_reference(
 
 @dataclass(frozen=True, eq=False)
 class Imprint:
-    """One image of a membrane, in contact or not.
+    """One image of a membrane, in contact or not."""
 
-    view: depth of the membrane as it is. pressed (H, W): smoothed deformation, metres. touching
-    (H, W): pixels in contact.
-    """
-
-    view: View
-    pressed: FloatArray
-    touching: BoolArray
+    view: View  # depth of the membrane as it is
+    pressed: FloatArray  # (H, W), smoothed deformation, metres
+    touching: BoolArray  # (H, W), pixels in contact
 
     @property
     def size(self) -> int:
-        """How many pixels are in contact."""
+        """Number of pixels in contact."""
         return int(self.touching.sum())
 
     def outweighs(self, other: Imprint | None) -> bool:
@@ -93,24 +99,41 @@ class Imprint:
 
 
 class Pad:
-    """One pad; its contact is that of the image with the most pixels in contact (Sec. V-B)."""
+    """A sensor whose contact is that of the image with the most pixels in contact (Sec. V-B)."""
 
-    reads: ClassVar[type] = ImageMessage
+    _camera: PinholeCamera
+    _cell: RobotCell
+    _reference: FloatArray  # (H, W), depth of the untouched membrane, metres, 0 where not known
+    _lengths: FloatArray  # (H, W), of the rays to depth 1
 
-    def __init__(
-        self,
-        rig: BubbleRig,
-        contact: ContactRig,
-        camera: PinholeCamera,
-        reference: FloatArray,
-        cell: RobotCell,
-    ) -> None:
-        """reference (H, W): depth of the untouched membrane, metres, 0 where it is not known."""
-        self._rig, self._contact, self._cell = rig, contact, cell
-        self._camera, self._reference = camera, reference
-        self._lengths = np.sqrt((camera.directions() ** 2).sum(axis=-1))
+    def __init__(self, rig: BubbleRig, contact: ContactRig) -> None:
+        self.name = rig.name
+        self.topics = image_topics(rig)
+        self.frame = rig.frame
+        self._rig = rig
+        self._contact = contact
         self._last_pose: FloatArray | None = None
         self._best: Imprint | None = None
+
+    def prepare(self, first_pass: FirstPass, cell: RobotCell) -> None:
+        """Take the intrinsics and the untouched membrane. Raise SessionError without them."""
+        self._cell = cell
+        self._camera = camera_of(self._rig, first_pass)
+        if self._rig.kind == "depth":
+            check_unit(self._rig, first_pass)
+        self._lengths = np.sqrt((self._camera.directions() ** 2).sum(axis=-1))
+        images = first_images(self._rig, first_pass)
+        begin = first_pass.windows[0].begin
+        untouched = [values for time, values in images if time < begin]
+        if self._rig.reference is None and self._rig.kind == "depth" and not untouched:
+            untouched = [values for _, values in images]
+            first_pass.warnings.warn(
+                f"{self.name}: no image before the first probe; its reference is made of the first "
+                f"{len(untouched)} of the probe"
+            )
+        self._reference = membrane_reference(
+            self._rig, untouched, camera=self._camera, beside=first_pass.folder
+        )
 
     def take(self, time: int, message: ImageMessage, counts: Counts, *, within: bool) -> None:
         """Use an image of the current probe; `within` its begin and end, contacts count."""
@@ -136,26 +159,28 @@ class Pad:
             "workspace"
         )
 
-    def strongest(self, counts: Counts) -> Imprint | None:
-        """The image of the contact since the last call."""
-        best, self._best = self._best, None
-        if best is not None:
-            counts.touching += best.size
-            self._mark(best.view, counts)
-        return best
+    def finish(self, step: int, counts: Counts) -> Sensed:
+        """Return the contact pixels of a probe, and the deformation as an image."""
+        best = self._best
+        self._best = None
+        if best is None:
+            return Sensed()
+        counts.touching += best.size
+        self._mark(best.view, counts)
+        return Sensed(candidates=self._contacts(best), image=self._image(step, best))
 
-    def image(self, step: int, imprint: Imprint) -> SensorImage:
-        """The deformation with the pixels in contact."""
+    def _image(self, step: int, imprint: Imprint) -> SensorImage:
+        """Return the deformation with the pixels in contact."""
         valid = imprint.view.valid & (imprint.pressed > 0.0)
         pressed = View(imprint.pressed, valid, self._camera, imprint.view.world_from_camera)
-        return recorded_image(step, self._rig.name, "deformation", pressed, imprint.touching)
+        return recorded_image(step, self.name, "deformation", pressed, imprint.touching)
 
-    def contacts(self, imprint: Imprint, chosen: np.ndarray) -> FloatArray:
-        """Points and outward normals of the object (C, 6), of chosen (C,) contact pixels."""
-        view, touching = imprint.view, imprint.touching
-        points = self._camera.back_project(view.metres)[touching][chosen]
+    def _contacts(self, imprint: Imprint) -> FloatArray:
+        """Return points and outward normals of the object (C, 6) at the contact pixels, world."""
+        view = imprint.view
+        points = self._camera.back_project(view.metres)[imprint.touching]
         filled = np.where(view.valid, view.metres, self._reference)
-        normals = self._normals(smooth(filled, self._contact.filter))[touching][chosen]
+        normals = self._normals(smooth(filled, self._contact.filter))[imprint.touching]
         pose = view.world_from_camera
         return np.concatenate([apply(pose, points), rotated(pose[:3, :3], normals)], axis=1)
 

@@ -261,19 +261,11 @@ class Rig(CheckedSettings):
         super().__post_init__()
         if self.workspace is not None:
             self.box()
-        names = [sensor.name for sensor in self.sensors]
-        if len(set(names)) < len(names):
-            raise SettingError(f"sensors are named {', '.join(names)}; accepted: each name once")
         if self.forces and (self.hand is None or not (self.hand.boxes or self.hand.urdf)):
             raise SettingError(
                 "forces need the solids of the hand, on which they act; accepted: hand.boxes, "
                 "hand.urdf"
             )
-
-    @property
-    def sensors(self) -> tuple[ImageRig, ...]:
-        """All that send depth images: the cameras, then the pads."""
-        return (*self.cameras, *self.bubbles)
 
     def box(self) -> Workspace:
         """The workspace. Raises SettingError if there is none, PointsError if it is empty."""

@@ -75,9 +75,8 @@ class Report:
 class LogWarnings:
     """Lines of text in the order in which their kinds came up."""
 
-    def __init__(self, before: LogWarnings | None = None) -> None:
-        """before: whose lines come ahead."""
-        self._counts: Counter[tuple[str, str]] = Counter(before._counts if before else {})
+    def __init__(self) -> None:
+        self._counts: Counter[tuple[str, str]] = Counter()
 
     def warn(self, text: str, count: int = 1) -> None:
         """Something is wrong, or was left out; `count` times."""

@@ -27,11 +27,12 @@ from runners.sensors.depth_camera import (
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
 from runners.sensors.depth_frame import depth_frame_points, read_depth_frame
 from runners.sensors.first_pass import FirstPass
-from runners.sensors.hand import HandModel
+from runners.sensors.hand import HandModel, HandPath
 from runners.sensors.log.clocks import in_time_order
 from runners.sensors.log.messages import Received
 from runners.sensors.log.raw_log import RawLog
 from runners.sensors.pose_file import beside, read_pose
+from runners.sensors.registry import sensors_of
 from runners.sensors.rig import Rig
 from runners.sensors.second_pass import SecondPass
 from runners.sensors.session_report import LogWarnings, Report
@@ -104,58 +105,78 @@ class SensorsSource(ProbeSource):
         self.free_resolution = settings.free_resolution
         self.start = Start(settings.start_contacts, settings.start_probe)
         self.world_from_object: FloatArray | None = None
-        self._rig, self._seed, self._images = rig, seed, settings.images
-        self._diameter, self._opening = diameter, LogWarnings()
-        self._hand = HandModel(rig.hand) if rig.hand else None
-        for text in self._hand.warnings if self._hand else ():
-            self._opening.warn(text)
+        self._rig = rig
+        self._diameter = diameter
+        self._lines = LogWarnings()
+        hand = HandModel(rig.hand) if rig.hand else None
+        for text in hand.warnings if hand else ():
+            self._lines.warn(text)
         self._log = RawLog(path)
         self._find_pose(path, settings.pose)
-        joints = self._hand.joint_names if self._hand else ()
-        sliding = self._hand.sliding if self._hand else ()
-        self._first_pass = FirstPass(
-            self._log, rig, joints, self._opening, lambda *_: None, sliding=sliding
+        sensors = sensors_of(rig, hand)
+        self._first_pass = FirstPass(self._log, rig, sensors, hand, warnings=self._lines)
+        free = FreeMap(self.workspace, self.free_resolution)
+        cell = RobotCell(
+            rig.world,
+            self._first_pass.tree,
+            gap=rig.clock.gap,
+            free=free,
+            warnings=self._lines,
+            gate=rig.gate,
+            diameter=diameter,
         )
-        missing = [name for name in joints if name not in self._first_pass.joints.first()]
-        if missing:
-            self._opening.warn(f"joints without a value are at 0: {', '.join(missing)}")
-        self.source = self._log.digest()
+        for sensor in sensors:
+            sensor.prepare(self._first_pass, cell)
+        self._first_pass.release()
+        path_of_hand = None
+        self._solids = None
+        if rig.hand is not None and hand is not None:
+            joints = self._first_pass.joints
+            path_of_hand = HandPath(rig.hand, hand, joints, times=cell.tree.times, cell=cell)
+            self._solids = hand.solids(joints.first())
+            missing = [name for name in hand.joint_names if name not in joints.first()]
+            if missing:
+                self._lines.warn(f"joints without a value are at 0: {', '.join(missing)}")
+        self._second_pass = SecondPass(
+            rig,
+            sensors,
+            path_of_hand,
+            cell=cell,
+            report=self.report,
+            seed=seed,
+            images=settings.images,
+        )
+        self._digest = self._log.digest()
         self.count = len(self._first_pass.windows)
-        self._free = FreeMap(self.workspace, self.free_resolution)
         if rig.boundary == "box_shell":
-            self._free.grid.at(box_shell(self._free.grid.lattice, self.workspace))
-        self.initial_points = KnownPoints(free=self._free.new())
+            free.grid.at(box_shell(free.grid.lattice, self.workspace))
+        self.initial_points = KnownPoints(free=free.new())
         annotated = {*rig.annotations.exclude, *(add.probe for add in rig.annotations.contacts)}
         for step in sorted(annotated - {window.step for window in self._first_pass.windows}):
-            self._opening.warn(f"the rig annotates probe {step}, which the log does not have")
+            self._lines.warn(f"the rig annotates probe {step}, which the log does not have")
 
     def probes(self) -> Iterator[ProbeEvent]:
-        """The probes of the log, in their order, once; its images are read as they go."""
-        rig, first_pass, warnings = self._rig, self._first_pass, LogWarnings(self._opening)
-        tree, gap, gate = first_pass.tree, rig.clock.gap, rig.gate
-        cell = RobotCell(rig.world, tree, gap, self._free, warnings, gate, self._diameter)
-        reading = SecondPass(
-            rig, first_pass, cell, self.report, self._hand, seed=self._seed, images=self._images
-        )
-        hand = self._hand.solids(first_pass.joints.first()) if self._hand else None
-        yield RigDescribed(-1, rig.name, self.source, hand)
+        """Yield the probes of the log, in their order, once; measurements are read as they go."""
+        first_pass = self._first_pass
+        yield RigDescribed(-1, self._rig.name, self._digest, self._solids)
         messages: Iterator[Received] = iter(())
-        if first_pass.bulky:
-            messages = self._log.messages(first_pass.bulky)
-        yield from reading.events(in_time_order(messages, first_pass.clocks.time))
-        reading.check()
+        if first_pass.measured():
+            messages = self._log.messages(first_pass.measured())
+        timed = in_time_order(messages, first_pass.clocks.time)
+        yield from self._second_pass.events(first_pass.windows, timed)
+        self._second_pass.check()
         for text, count in self._log.faults.items():
-            warnings.warn(text, count)
+            self._lines.warn(text, count)
         for name, counts in self.report.total().items():
             if left_out := counts.left_out():
-                warnings.note(f"{name}: {left_out}")
+                self._lines.note(f"{name}: {left_out}")
             if counts.edges > _MANY_EDGES * counts.pixels:
                 share = 100 * counts.edges // counts.pixels
-                warnings.warn(
+                self._lines.warn(
                     f"{name}: {share} % of its pixels are left out as "
                     "edges; a larger edge (m), or a smaller edge_reach (pixels), keeps more"
                 )
-        self.report.lines = warnings.lines()
+        self.report.lines = self._lines.lines()
         last = first_pass.windows[-1].step
         yield from (Logged(last, level, text) for level, text in self.report.lines)
 
@@ -163,21 +184,22 @@ class SensorsSource(ProbeSource):
         """Release nothing, as nothing is held open."""
 
     def _find_pose(self, path: Path, chosen: str | None) -> None:
-        """The true pose, if there is a file of it."""
+        """Read the true pose, if there is a file of it."""
         if chosen == NO_POSE:
             return
         file = Path(chosen).expanduser() if chosen else beside(path)
         if chosen or file.is_file():
             self.world_from_object = read_pose(file)
-            place, (lower, upper) = self.world_from_object[:3, 3], self.workspace.bounds
-            beyond = np.maximum(np.maximum(lower - place, place - upper), 0.0)
+            position = self.world_from_object[:3, 3]
+            lower, upper = self.workspace.bounds
+            beyond = np.maximum(np.maximum(lower - position, position - upper), 0.0)
             away = float(np.sqrt((beyond**2).sum()))
             if away > (self._diameter or _FAR):
-                self._opening.warn(
+                self._lines.warn(
                     f"the true pose of {file.name} is {away:.3g} m outside of the workspace; check "
                     f"its unit, which is metres, and its frame, which is {self._rig.world}"
                 )
-            self._opening.note(f"the true pose is that of {file.name}")
+            self._lines.note(f"the true pose is that of {file.name}")
 
 
 class DepthFrameSource(ProbeSource):

@@ -6,14 +6,15 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from mcap.records import Schema
 
+from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
-from chsel.sensing.depth_camera import PinholeCamera
+from chsel.sensing.depth_camera import PinholeCamera, matrix_numbers
 from replay.mcap.texts import one_line
 from runners.sensors.log.images import compressed_pixels, pixel_rows
 from runners.sensors.log.messages import (
@@ -34,7 +35,7 @@ _NANOSECONDS = 10**9
 _END_OF_TIME = 2**63
 _FURTHEST = 1e9  # metres: no robot works further from the origin of its frame
 _FLOATS = {7: "f4", 8: "f8"}  # in sensor_msgs/PointField and foxglove.PackedElementField alike
-_LEAST_SKEW = 0.001  # of a focal length: less is no matter
+_MOST_SKEW = 0.001  # of a focal length: less does not matter
 _AXES = ("x", "y", "z")
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begin of a frame of zstd; messages of CDR begin with 0
 _COMPRESSED = UnusableMessage(
@@ -155,57 +156,51 @@ def _compressed_image(message: Any, frame: str) -> ImageMessage:
 
 
 def _ros2_camera(message: Any, _: str) -> CameraInfoMessage:
-    """Of the pixels that are sent: a region of the sensor, and several of its pixels as one."""
-    region, across, down = message.roi, max(message.binning_x, 1), max(message.binning_y, 1)
+    """Return intrinsics of the pixels that are sent: a region of the sensor, binned."""
+    info = _camera(message.width, message.height, k=message.k, p=message.p, d=message.d)
+    region = message.roi
+    across = max(message.binning_x, 1)
+    down = max(message.binning_y, 1)
 
-    def camera(numbers: Numbers) -> PinholeCamera:
+    def sent(camera: PinholeCamera) -> PinholeCamera:
         return PinholeCamera(
-            (region.width or message.width) // across,
-            (region.height or message.height) // down,
-            numbers.fx / across,
-            numbers.fy / down,
-            (numbers.cx - region.x_offset) / across,
-            (numbers.cy - region.y_offset) / down,
+            width=(region.width or camera.width) // across,
+            height=(region.height or camera.height) // down,
+            fx=camera.fx / across,
+            fy=camera.fy / down,
+            cx=(camera.cx - region.x_offset) / across,
+            cy=(camera.cy - region.y_offset) / down,
         )
 
-    return _camera(camera, message.k, message.p, message.d)
-
-
-def _camera(
-    camera: Callable[[Numbers], PinholeCamera], k: Any, p: Any, d: Any
-) -> CameraInfoMessage:
-    """k, p, d: matrices of the camera as it is (9) and rectified (12, or none), distortion."""
-    rectified = None
-    if len(p) == 12 and p[0] != 0.0:
-        with suppress(UnusableMessage):  # who rectifies no images may leave anything there
-            rectified = camera(_intrinsics("P", [*p[:3], *p[4:7], *p[8:11]]))
-    return CameraInfoMessage(camera(_intrinsics("K", k)), any(d), rectified)
-
-
-class Numbers(NamedTuple):
-    """Focal lengths and principal point of a whole sensor, pixels."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-
-def _intrinsics(name: str, matrix: Any) -> Numbers:
-    """The numbers in a matrix of a camera (9), row by row."""
-    fx, skew, cx, zero, fy, cy, *last = (float(value) for value in matrix)
-    straight = abs(skew) <= _LEAST_SKEW * abs(fx) and zero == 0.0 and last == [0.0, 0.0, 1.0]
-    if not (straight and np.isfinite([fx, fy, cx, cy]).all()):
-        listed = ", ".join(f"{value:g}" for value in matrix)
-        raise UnusableMessage(f"{name} is [{listed}]; accepted: fx, 0, cx, 0, fy, cy, 0, 0, 1")
-    return Numbers(fx, fy, cx, cy)
+    rectified = None if info.rectified is None else sent(info.rectified)
+    return CameraInfoMessage(sent(info.camera), info.distorted, rectified)
 
 
 def _foxglove_camera(message: Any, _: str) -> CameraInfoMessage:
-    size = message.width, message.height
-    return _camera(
-        lambda numbers: PinholeCamera(*size, **numbers._asdict()), message.K, message.P, message.D
-    )
+    return _camera(message.width, message.height, k=message.K, p=message.P, d=message.D)
+
+
+def _camera(width: int, height: int, *, k: Any, p: Any, d: Any) -> CameraInfoMessage:
+    """Return intrinsics of all pixels of a sensor.
+
+    k: matrix (9) of images as they are. p: matrix (12, or none) of rectified ones. d: distortion.
+    """
+    rectified = None
+    if len(p) == 12 and p[0] != 0.0:
+        with suppress(UnusableMessage):  # who rectifies no images may leave anything there
+            rectified = _pinhole("P", [*p[:3], *p[4:7], *p[8:11]], width=width, height=height)
+    return CameraInfoMessage(_pinhole("K", k, width=width, height=height), any(d), rectified)
+
+
+def _pinhole(name: str, numbers: Any, *, width: int, height: int) -> PinholeCamera:
+    """Return the camera of a matrix (9), row by row."""
+    try:
+        fx, fy, cx, cy = matrix_numbers(np.reshape(numbers, (3, 3)), skew=_MOST_SKEW)
+    except SettingError:
+        listed = ", ".join(f"{value:g}" for value in numbers)
+        text = f"{name} is [{listed}]; accepted: fx, 0, cx, 0, fy, cy, 0, 0, 1"
+        raise UnusableMessage(text) from None
+    return PinholeCamera(width, height, fx=fx, fy=fy, cx=cx, cy=cy)
 
 
 def _ros2_cloud(message: Any, frame: str) -> CloudMessage:

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from chsel.errors import SessionError, SettingError
 from chsel.events import Logged, Probe, RigDescribed, SensorImage
 from chsel.problem.poses import apply, compose, inverse
-from runners.sensors.first_pass import RECTIFIED
+from runners.sensors.depth_camera import RECTIFIED
 from runners.sensors.pose_file import beside, write_pose
 from runners.sensors.rig import Annotations, CloudRig, ExtraContacts, HandRig, ProbeTimes
 from runners.sessions.sensors import SensorsSettings, SensorsSource
