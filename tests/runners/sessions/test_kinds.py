@@ -23,7 +23,7 @@ from runners.sessions.source import ObjectOrigin, ProbeEvent, ProbeSource, Steer
 from tests.chsel.samples import REPOSITORY
 from tests.runners.sensors.sphere_log import RIG, SphereLog
 
-RECORDING = REPOSITORY / "tests" / "replays" / "mustard_chsel.mcap"
+RECORDING = REPOSITORY / "tests" / "replays" / "mustard_svgd.mcap"
 MODEL = ObjectModel("spam_can", load_model("spam_can", 2.5), 2.5, 0.001, "can", of_paper=True)
 STARTED = {"start_contacts": 3, "start_probe": 2}
 
@@ -52,7 +52,9 @@ def test_a_source_of_every_kind_has_all_members_of_the_protocol(kind, tmp_path):
     members = {*ProbeSource.__annotations__, "probes", "close"}
     assert members <= {name for name in members if hasattr(source, name)}
     assert isinstance(source.workspace, Workspace)
-    assert source.free_resolution == (0.025 if origin is ObjectOrigin.PLACED else 0.01)
+    sides = {ObjectOrigin.PLACED: 0.025, ObjectOrigin.REAL: 0.01}
+    sides[ObjectOrigin.RECORDED] = read_recording(RECORDING).start.free_resolution
+    assert source.free_resolution == sides[origin]
     assert isinstance(source.initial_points, KnownPoints)
     assert source.start == (3, 2)
     assert source.push_distance == 0.0
