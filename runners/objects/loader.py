@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ObjectConfig(CheckedSettings):
-    """Which object, and how large."""
+    """An object and its scale."""
 
     name: str
     scale: Annotated[float, positive]  # multiplies the mesh into the metres of the session
@@ -117,9 +117,9 @@ class ObjectModel:
 
 
 def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:
-    """The object that `config` names; scans come from the folder `assets`.
+    """Return the object that `config` names; scans come from the folder `assets`.
 
-    Raises SettingError for an unknown model, MeshError if the mesh is missing or unusable.
+    Raise SettingError for an unknown model, MeshError if the mesh is missing or unusable.
     """
     if config.kind == "file":
         mesh = load_mesh(config.path or "", scale=config.scale)
@@ -138,13 +138,13 @@ def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:
 
 
 def _of_paper(config: ObjectConfig) -> bool:
-    """Whether an object is one of the paper's simulated trials, at its scale there."""
+    """Return whether an object is one of the paper's simulated trials, at its scale there."""
     shipped = config.kind == "model" or SCANS.get(config.scan or "") == config.name
     return shipped and config.kind != "file" and config.scale == _TRIALS[config.name][0]
 
 
 def check_size(model: ObjectModel, workspace: Workspace) -> list[MeshWarning]:
-    """A warning for an object that is enlarged, or longer than the workspace.
+    """Return a warning for an object that is enlarged, or longer than the workspace.
 
     The objects of simulated sessions are enlarged by default; given points are of real ones.
     """
@@ -160,6 +160,6 @@ def check_size(model: ObjectModel, workspace: Workspace) -> list[MeshWarning]:
 
 
 def load_model(name: str, scale: float = 1.0) -> trimesh.Trimesh:
-    """One of MODELS in the frame of its YCB mesh; metres at scale 1."""
+    """Return one of MODELS in the frame of its YCB mesh; metres at scale 1."""
     require_choice("object.name", name, MODELS)
     return load_mesh(Path(__file__).parent / "models" / f"{name}.ply", scale=scale)

@@ -33,7 +33,7 @@ _EARLY = 0.95  # of the interval between two images: stamps are not exact
 _LEAST_WITHIN = 0.01  # of the numbers, or else these are no depths in metres
 _SHIFTED = 0.5  # pixels by which intrinsics differ
 RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
-"""What topics of rectified images are named, by the convention of ROS."""
+"""Pattern of the names of topics of rectified images, by the convention of ROS."""
 
 MISSED = (
     "its rays miss the workspace; check its frame, which must be the optical one (x right, z "
@@ -59,7 +59,7 @@ def view_of(
     cell: RobotCell,
     counts: Counts,
 ) -> View | None:
-    """An image at a time, nanoseconds, and its pose; None, counted, where it cannot be used."""
+    """Return an image at a time, nanoseconds, with its pose; None, counted, if it is unusable."""
     shape = (camera.height, camera.width)
     if message.values.shape != shape:
         cell.warnings.warn(
@@ -79,14 +79,14 @@ def view_of(
 
 
 def metres(values: np.ndarray, unit: float | None) -> FloatArray:
-    """An image (H, W) in metres; unit: metres, by default INTEGER_UNIT for integers, else 1."""
+    """Return an image (H, W) in metres; unit: by default INTEGER_UNIT of integers, else 1."""
     if unit is None:
         unit = INTEGER_UNIT if np.issubdtype(values.dtype, np.integer) else 1.0
     return values.astype(np.float64) * unit
 
 
 def recorded_image(step: int, sensor: str, kind: str, view: View, mask: BoolArray) -> SensorImage:
-    """An image with a mask (H, W) as recordings have it, 0 where it is not valid."""
+    """Return an image with a mask (H, W) as recordings have it, 0 where it is not valid."""
     kept, camera = np.where(view.valid, view.metres, 0.0), view.camera
     unit = FINE if kept.max(initial=0.0) < 65535 * FINE else COARSE
     values = np.clip(np.rint(kept / unit), 0, 65535).astype(np.uint16)
@@ -95,7 +95,7 @@ def recorded_image(step: int, sensor: str, kind: str, view: View, mask: BoolArra
 
 
 def edge_pixels(rig: CameraRig, view: View) -> BoolArray:
-    """Valid pixels (H, W) beside a jump of depth; none, if the rig asks for all."""
+    """Return valid pixels (H, W) beside a jump of depth; none, if the rig asks for all."""
     if rig.edge is None:
         return np.zeros_like(view.valid)
     return occlusion_edges(view.metres, view.valid, rig.edge, reach=rig.edge_reach)
@@ -106,7 +106,7 @@ def mark_rays(
 ) -> tuple[int, int]:
     """Mark what the rays of usable pixels (H, W) pass.
 
-    The rays of speckles end at the least depth of the valid pixels around them. Returns how many
+    The rays of speckles end at the least depth of the valid pixels around them. Return how many
     voxels became free, and how many pixels are of speckles.
     """
     regions = depth_regions(view.metres, usable, view.camera, gate.jump)
@@ -116,7 +116,7 @@ def mark_rays(
 
 
 def some_rays(rig: CameraRig, view: View, usable: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Origin (3,) and ends (N, 3), world, of the rays of some of the usable pixels (H, W)."""
+    """Return origin (3,) and ends (N, 3), world, of rays of some of the usable pixels (H, W)."""
     pose, some = view.world_from_camera, slice(None, None, 1 + usable.size // _MANY_PIXELS)
     ends = rig.fraction * view.camera.back_project(view.metres)[some, some]
     return pose[:3, 3], apply(pose, ends[usable[some, some]])

@@ -37,7 +37,7 @@ class SensorTopic:
     """Class of its messages in `log/messages.py`; messages of other classes are not read."""
 
     use: str
-    """What the sensor reads of it, as messages to users say, such as "depth of camera"."""
+    """Use of the topic, as messages to users say, such as "depth of camera"."""
 
 
 class TopicReader(Protocol):
@@ -57,7 +57,7 @@ class TopicReader(Protocol):
 
 
 class FirstPass:
-    """What is known of a log before its measurements are read one by one."""
+    """Knowledge of a log before its measurements are read one by one."""
 
     tree: TransformTree
     """Transforms between all frames."""

@@ -121,7 +121,7 @@ class ForceSensor:
         )
 
     def _set_tare(self, time: int) -> None:
-        """The median of what came last; without any, the tare stays what it was."""
+        """Take the median of what came last as the tare; without any, keep the tare."""
         since = time - self._rig.tare * _NANOSECONDS
         idle = [numbers for moment, numbers in self._idle if moment >= since]
         self._idle.clear()
@@ -140,13 +140,13 @@ class ForceSensor:
             self._row.clear()
 
     def _end_row(self, counts: Counts) -> None:
-        """The force is no longer above the threshold, or its probe is over."""
+        """End a row of samples, as the force is below the threshold or the probe is over."""
         counts.spikes += len(self._row)
         self._row.clear()
         self._in_contact = False
 
     def _contact(self, sample: _Sample, counts: Counts) -> FloatArray | None:
-        """Where a force acts, and the object's outward normal (6,), world; None, counted."""
+        """Return where a force acts, and the outward normal (6,), world; None, counted."""
         sensor = self._rig.frame or sample.frame
         world_from_sensor = self._cell.world_from(sensor, sample.time, self._rig.topic)
         world_from_hand = self._cell.world_from(self._hand.frame, sample.time, self._rig.topic)

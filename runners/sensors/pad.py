@@ -44,10 +44,10 @@ REACH = 0.1  # m: of the membrane from its camera, for how far a turn moves it
 def membrane_reference(
     rig: BubbleRig, samples: list[np.ndarray], camera: PinholeCamera, beside: Path
 ) -> FloatArray:
-    """Depth (H, W) of a pad's untouched membrane, metres, 0 where it is not known.
+    """Return depth (H, W) of a pad's untouched membrane, metres, 0 where it is not known.
 
     By the rig's file, relative to the folder `beside` unless it is found as it stands; or the
-    median of images (H, W). Raises SessionError if there are none, or of another size.
+    median of images (H, W). Raise SessionError if there are none, or of another size.
     """
     images = samples if rig.kind == "depth" else []
     if rig.reference is not None:
@@ -92,7 +92,7 @@ class Imprint:
         return int(self.touching.sum())
 
     def outweighs(self, other: Imprint | None) -> bool:
-        """Whether more pixels are in contact, or without any contact, the membrane gives more."""
+        """Return whether more pixels are in contact, or without any, the membrane gives more."""
         if other is None or self.size != other.size:
             return other is None or self.size > other.size
         return self.size == 0 and bool(self.pressed.max() > other.pressed.max())
@@ -150,7 +150,7 @@ class Pad:
         counts.spared += not (within or moved)
 
     def remark(self, total: Counts) -> str:
-        """What is suspicious about all that it gave; "" if nothing is."""
+        """Return what is suspicious about all that it gave; "" if nothing is."""
         if not total.used or total.free or total.contacts:
             return ""
         return (
@@ -216,7 +216,7 @@ class Pad:
     def _main(
         self, depth: FloatArray, usable: BoolArray, counts: Counts, *, least: int = 0
     ) -> BoolArray:
-        """Of pixels (H, W) those in regions without a jump of depth that are not too small.
+        """Return those of pixels (H, W) in regions without a jump of depth that are not too small.
 
         least: pixels of a region.
         """
@@ -228,7 +228,7 @@ class Pad:
         return kept
 
     def _mark(self, view: View, counts: Counts) -> None:
-        """The pad's inside is free, less half a voxel's diagonal before what it may touch."""
+        """Mark the pad's inside as free, less half a voxel's diagonal before what it may touch."""
         depth = view.metres - sqrt(0.75) * self._cell.spacing / self._lengths
         inside, pose = view.valid & (depth > 0.0), view.world_from_camera
         counts.free += self._cell.free.grid.from_depth(
@@ -236,7 +236,7 @@ class Pad:
         )
 
     def _has_moved(self, pose: FloatArray) -> bool:
-        """Whether the membrane is half a voxel away from where it was last marked."""
+        """Return whether the membrane is half a voxel away from where it was last marked."""
         if self._last_pose is not None:
             change = inverse(self._last_pose) @ pose
             distance = np.sqrt((change[:3, 3] ** 2).sum())
@@ -246,7 +246,7 @@ class Pad:
         return True
 
     def _normals(self, depth: FloatArray) -> FloatArray:
-        """Unit normals (H, W, 3) of a depth image's surface, towards the camera; 0 if unknown."""
+        """Return unit normals (H, W, 3) of a depth image, towards the camera; 0 if unknown."""
         points = self._camera.back_project(depth)
         normals = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
         away = (normals * points).sum(axis=-1, keepdims=True) > 0.0

@@ -55,7 +55,7 @@ class PointsSettings:
     """[[x0, x1], [y0, y1], [z0, z1]], metres; None: around the points, padded by the diameter."""
     free_resolution: float = FREE_RESOLUTION  # voxel side of free space, metres
     object_resolution: float | None = None
-    """Of the SDF grid, metres; None: by the object, see `ObjectModel.resolution`."""
+    """Spacing of the SDF grid, metres; None: by the object, see `ObjectModel.resolution`."""
     object_padding: float = OBJECT_PADDING  # of the SDF grid, metres
     start_contacts: int = 0  # a registration needs so many contacts
     start_probe: int = 0  # and this index of the probe
@@ -108,7 +108,7 @@ class PointsSource(ProbeSource):
         self.workspace = given or workspace_around(every, object_model.grid(settings))
 
     def probes(self) -> Iterator[Probe]:
-        """One probe per step of the file."""
+        """Yield one probe per step of the file."""
         for step, points in zip(self._steps, self._points, strict=True):
             contacts = self._file.at(step).contacts
             yield Probe(step, "points", points, contacts=contacts, contact_normals=0.0 * contacts)
@@ -144,7 +144,7 @@ class PointFile:
     world_from_object: FloatArray | None = None  # (4, 4): the true pose, where it is given
 
     def at(self, step: int) -> KnownPoints:
-        """All that becomes known at a step; surface points are known points of distance 0."""
+        """Return all that becomes known at a step; surface points have distance 0."""
         surface, free, occupied, known = (
             np.flatnonzero((self.kinds == kind) & (self.steps == step)) for kind in CLASSES
         )
@@ -156,7 +156,7 @@ class PointFile:
 def read_points(path: str | Path) -> PointFile:
     """Read .npz, .csv, or the vertices of .ply, .off, .xyz and .stl as surface points.
 
-    Raises PointsError, which names the file and the array or row, for anything malformed.
+    Raise PointsError, which names the file and the array or row, for anything malformed.
     """
     path = Path(path).expanduser()
     reader = _READERS.get(path.suffix.lower())
@@ -198,7 +198,7 @@ def _read_npz(path: Path) -> PointFile:
 
 
 def _npz_part(kind: str, arrays: dict[str, Any]) -> tuple[np.ndarray, ...]:
-    """Kinds, points, signed distances and steps of one array of points."""
+    """Return kinds, points, signed distances and steps of one array of points."""
     points = frozen(kind, arrays[kind], (None, 3))
     nothing = np.zeros(len(points), dtype=np.int64)
     sdf = frozen("known_sdf", arrays["known_sdf"] if kind == "known" else nothing, nothing.shape)
@@ -250,7 +250,7 @@ def _read_csv(path: Path) -> PointFile:
 
 
 def _wrong_length(path: Path) -> str:
-    """Which row of a .csv file has more values than there are columns; "" if none has."""
+    """Return which row of a .csv file has more values than columns; "" if none has."""
     with suppress(ValueError, csv.Error), path.open(newline="", encoding="utf-8-sig") as file:
         rows = csv.reader(file)
         columns = len(next(rows, ()))
@@ -262,7 +262,7 @@ def _wrong_length(path: Path) -> str:
 
 
 def _not_a_number(table: Any) -> str:
-    """The first value of a table that is not a number."""
+    """Return the first value of a table that is not a number."""
     for row, values in enumerate(table.itertuples(index=False), 1):
         for name, value in zip(table.columns, values, strict=True):
             try:
@@ -273,13 +273,13 @@ def _not_a_number(table: Any) -> str:
 
 
 def _unreadable(suffix: str, error: Exception) -> str:
-    """What a reader of a foreign format says, on one line."""
+    """Return what a reader of a foreign format says, on one line."""
     reason = " ".join(str(error).split()) or type(error).__name__
     return f"not a readable {suffix} file ({reason[:200]})"
 
 
 def _read_surface(path: Path) -> PointFile:
-    """Every vertex of a mesh or point cloud is a surface point, those at one place together one."""
+    """Return every vertex of a mesh or point cloud as a surface point, each place once."""
     import trimesh
 
     kind = path.suffix.lower().removeprefix(".")
@@ -295,7 +295,7 @@ def _read_surface(path: Path) -> PointFile:
 
 
 def _vertices(geometry: Any) -> FloatArray:
-    """All vertices (V, 3); of those of a mesh's faces, one for each place."""
+    """Return all vertices (V, 3); of those of a mesh's faces, one for each place."""
     import trimesh
 
     vertices = np.asarray(geometry.vertices, dtype=np.float64).reshape(-1, 3)

@@ -142,9 +142,9 @@ class ProbingSource(Steerable):
         seed: int,
         hand: ProbingHand,
     ) -> None:
-        """mesh: the registered one, in its frame, metres. hand: that of the engine.
+        """Make the source of a registered mesh, in its frame, metres; hand: that of the engine.
 
-        Raises SettingError if nothing of the hand is deep enough to sweep.
+        Raise SettingError if nothing of the hand is deep enough to sweep.
         """
         self.configuration = configuration
         self.settings = settings
@@ -192,7 +192,7 @@ class ProbingSource(Steerable):
             yield self._probe(step)
 
     def offer(self, settings: ActionSettings) -> Actions:
-        """The probes that can be chosen from; see `Steerable`."""
+        """Return the probes that can be chosen from; see `Steerable`."""
         push = self.settings.push_steps * self.settings.step_length
         if settings.choice == "around":
             offered = around_actions(settings, self.workspace, self.hand)
@@ -208,7 +208,7 @@ class ProbingSource(Steerable):
         return offered
 
     def available(self) -> BoolArray:
-        """The actions (A,) that were not taken yet: again, they would show nothing new."""
+        """Return the actions (A,) that were not taken yet; repeated, they show nothing new."""
         return self._available.copy()
 
     def take(self, step: int, action: int) -> Iterator[Probe]:
@@ -225,7 +225,7 @@ class ProbingSource(Steerable):
         self._engine.close()
 
     def _probe(self, step: int, rotation: FloatArray = ROTATION) -> Probe:
-        """What the gripper has done since it last forgot, turned by a rotation world_from_hand."""
+        """Return what the gripper has done since `forget`, turned by a rotation world_from_hand."""
         done = self._gripper
         ends, contacts = np.array(done.ends), np.array(done.contacts).reshape(-1, 3)
         normals = np.array(done.normals).reshape(-1, 3)
@@ -246,7 +246,7 @@ class ProbingSource(Steerable):
         return probe if probe.push is None else self._pushed(probe, probe.push)
 
     def _pushed(self, probe: Probe, direction: FloatArray) -> Probe:
-        """The same after the object has moved in a direction (3,), unless it stands."""
+        """Move the object in a direction (3,), unless it stands; return the probe with its pose."""
         if self.push_distance > 0.0:
             self._voxels.forget()  # what was free before has moved with the object
         if self.settings.moves == 0.0:
@@ -263,7 +263,7 @@ class ProbingSource(Steerable):
         return replace(probe, world_from_object=pose)
 
     def _boundary(self, mesh: trimesh.Trimesh, world_from_object: FloatArray) -> FloatArray:
-        """Centres (N, 3) of the voxels where the object is known not to be."""
+        """Return centres (N, 3) of the voxels where the object is known not to be."""
         lattice, chosen = self._voxels.lattice, self.settings.boundary
         vertices = apply(world_from_object, np.asarray(mesh.vertices))
         parts = {"box_shell": box_shell(lattice, self.workspace)}
@@ -274,14 +274,14 @@ class ProbingSource(Steerable):
 
 
 def choose_workspace(configuration: Configuration, settings: ProbingSettings) -> Workspace:
-    """The box in which the object is sought."""
+    """Return the box in which the object is sought."""
     if settings.workspace == "paper" and configuration.name != FITTED:
         return WORKSPACE
     return configuration.workspace
 
 
 def floor_slab(lattice: Lattice, vertices: FloatArray) -> FloatArray:
-    """Centres of the lattice's lowest layers, below the floor, under and around vertices (V, 3)."""
+    """Return centres of the lattice's lowest layers, under and around vertices (V, 3)."""
     low = lattice.voxels(vertices.min(axis=0, keepdims=True) - SLAB_MARGIN)[0]
     high = lattice.voxels(vertices.max(axis=0, keepdims=True) + SLAB_MARGIN)[0]
     low[2], high[2] = 0, SLAB_LAYERS - 1
@@ -289,7 +289,7 @@ def floor_slab(lattice: Lattice, vertices: FloatArray) -> FloatArray:
 
 
 def box_shell(lattice: Lattice, workspace: Workspace) -> FloatArray:
-    """Centres of one layer of voxels on the six faces of the workspace."""
+    """Return centres of one layer of voxels on the six faces of the workspace."""
     last = lattice.voxels(workspace.bounds[1:])[0]
     shell = np.ones(last + 1, dtype=bool)
     shell[1:-1, 1:-1, 1:-1] = False
@@ -297,7 +297,7 @@ def box_shell(lattice: Lattice, workspace: Workspace) -> FloatArray:
 
 
 def swept_voxels(lattice: Lattice, interior: FloatArray, positions: FloatArray) -> FloatArray:
-    """Centres of the voxels that interior (M, 3) meets at any of the hand's positions (P, 3)."""
+    """Return centres of the voxels that interior (M, 3) meets at one of positions (P, 3)."""
     bounds = np.array([positions.min(axis=0), positions.max(axis=0)])
     bounds += [interior.min(axis=0), interior.max(axis=0)]
     low, high = lattice.voxels(bounds)

@@ -43,7 +43,7 @@ class ProblemFile:
 
 
 class ProbedProblems:
-    """All points up to a step; where a registration starts does not matter here."""
+    """Problems of all points up to a step, wherever a registration starts."""
 
     def __init__(
         self, events: Sequence[Event], of: ProbeSource | SessionStarted, sdf: SdfGrid, seed: int
@@ -53,7 +53,7 @@ class ProbedProblems:
         self.steps = tuple(probe.step for probe in self._probes)
 
     def problem(self, step: int) -> RegistrationProblem:
-        """All that is known at a step."""
+        """Return the problem of all that is known at a step."""
         new = [probe.new_points for probe in self._probes if probe.step <= step]
         return RegistrationProblem(
             self._sdf,
@@ -65,7 +65,7 @@ class ProbedProblems:
         )
 
     def hypotheses(self, step: int) -> None:
-        """Nothing was registered."""
+        """Return None, as nothing was registered."""
 
 
 class RecordedProblems:
@@ -75,7 +75,7 @@ class RecordedProblems:
         self.problem, self._recording = recording.problem, recording
 
     def hypotheses(self, step: int) -> Hypotheses | None:
-        """What was found at a step, if that was recorded."""
+        """Return the result of a step, if one was recorded."""
         return self._recording.hypotheses(step) if self._recording.has_result(step) else None
 
 
@@ -86,7 +86,7 @@ def open_problem_file(
     assets: Path,
     seed: int,
 ) -> ProblemFile:
-    """A recording; else a raw log or a file of known points, for which the object must be named.
+    """Open a recording; else a raw log or a file of known points, whose object must be named.
 
     session: its settings, for what is not a recording; raw logs need those of kind "sensors", with
     which a .yaml is a depth image.
@@ -134,7 +134,7 @@ def _recorded(path: Path) -> ProblemFile:
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is a recording, by its name and header; also if that cannot be read."""
+    """Return whether a file is a recording, by its name and header; also if it is unreadable."""
     if path.suffix.lower() != ".mcap":
         return False
     if not path.is_file():

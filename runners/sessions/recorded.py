@@ -30,7 +30,7 @@ from runners.sessions.source import ObjectOrigin, SourceKind, Steerable, require
 
 @dataclass(frozen=True)
 class RecordedSettings:
-    """A recording brings its own object, workspace and resolutions."""
+    """A recording, which brings the object, workspace and resolutions."""
 
     path: str | None = None  # the recording.mcap
     start_contacts: int | None = None  # a registration needs so many; None: as in the recording
@@ -73,7 +73,7 @@ class RecordedSource(Steerable):
             raise PointsError(f"recording {settings.path}: {error}") from None
 
     def probes(self) -> Iterator[Probe]:
-        """The recorded probes in their order."""
+        """Yield the recorded probes in their order."""
         for probe in self._probes:
             if probe.world_from_object is not None:
                 self.world_from_object = probe.world_from_object
@@ -81,7 +81,7 @@ class RecordedSource(Steerable):
 
     @cached_property
     def hand(self) -> HandShape:
-        """That of the recording, which probes along the z axis of its path; see `Steerable`.
+        """The recording's hand, which probes along the z axis of its path; see `Steerable`.
 
         Raises SessionError if the recording does not describe it.
         """
@@ -99,7 +99,7 @@ class RecordedSource(Steerable):
         return open_hand(described).shape
 
     def offer(self, settings: ActionSettings) -> Actions:
-        """The recorded probes, each as an action, whatever is chosen; see `Steerable`."""
+        """Return the recorded probes, each as an action, whatever is chosen; see `Steerable`."""
         if any(probe.world_from_object is not None for probe in self._probes):
             raise SessionError(
                 f"recording {self._recording.path} has an object that moved, so that its probes "
@@ -108,13 +108,13 @@ class RecordedSource(Steerable):
         return self._actions.offer(settings)
 
     def available(self) -> BoolArray:
-        """The probes (A,) that were not taken yet."""
+        """Return the probes (A,) that were not taken yet."""
         return self._actions.available.copy()
 
     def take(self, step: int, action: int) -> Iterator[Probe]:
-        """A recorded probe as that of this step, with all of its path that is free.
+        """Yield a recorded probe as that of this step, with all of its path that is free.
 
-        What another one has shown before is not new. Raises SessionError if it was taken.
+        What another one has shown before is not new. Raise SessionError if it was taken.
         """
         require_available(action, self._actions.available)
         yield self._actions.take(step, action)
@@ -133,7 +133,7 @@ class RecordedSource(Steerable):
     def online(
         self, settings: OnlineSettings, seed: int, *, only: Container[int] | None = None
     ) -> OnlineRegistration:
-        """The loop of this session, before its first step; see `OnlineRegistration`."""
+        """Return the loop of this session, before its first step; see `OnlineRegistration`."""
         return OnlineRegistration(
             self.recorded.sdf,
             self.workspace,
@@ -147,7 +147,7 @@ class RecordedSource(Steerable):
         )
 
     def perceived(self) -> Iterator[tuple[int, KnownPoints, FloatArray | None]]:
-        """The steps of the session with the points that are new in each, and pushes."""
+        """Return the steps with the points that are new in each, and pushes."""
         return ((probe.step, probe.new_points, probe.push) for probe in self.probes())
 
     def close(self) -> None:
@@ -176,16 +176,18 @@ class RecordedActions:
     """Probes that can be taken in any order, each once.
 
     A recording names each voxel of free space once, with the probe that swept it first. A probe
-    that is taken out of order sweeps again what earlier ones of the recording had swept: so much
+    that is taken out of order also sweeps what earlier ones of the recording had swept: so much
     of its path is free.
     """
 
     def __init__(
         self, probes: Sequence[Probe], hand: HandShape, lattice: Lattice, *, depth: float
     ) -> None:
-        """lattice: of the voxels of free space. depth: of the hand's interior that sweeps, metres.
+        """Make the actions of probes.
 
-        Raises SessionError for probes without a push along the hand's z axis.
+        lattice: of the voxels of free space. depth: of the hand's interior that sweeps, metres.
+
+        Raise SessionError for probes without a push along the hand's z axis.
         """
         self._probes, self._lattice = list(probes), lattice
         pushes = [_push(probe) for probe in self._probes]
@@ -206,12 +208,12 @@ class RecordedActions:
         self._voxels = lattice.voxels(self._free)  # (N, 3)
 
     def offer(self, settings: ActionSettings) -> Actions:
-        """An action for each probe, as long as the longest push of them; reach does not matter."""
+        """Return an action for each probe, as long as the longest push; reach does not matter."""
         length = np.full(len(self._starts), self._length)
         return straight_actions(replace(settings, reach=None), self._starts, length)
 
     def take(self, step: int, action: int) -> Probe:
-        """The probe of an action, as the one of this step."""
+        """Return the probe of an action, as the one of this step."""
         probe = self._probes[action]
         self.available[action] = False
         chosen = ~self._given & (self._first <= action)
@@ -223,7 +225,7 @@ class RecordedActions:
         return replace(probe, step=step, new_points=new)
 
     def _swept(self, voxels: np.ndarray, path: FloatArray) -> BoolArray:
-        """Which of voxels (N, 3) the hand's interior meets on a path (P, 4, 4)."""
+        """Return which of voxels (N, 3) the hand's interior meets on a path (P, 4, 4)."""
         if len(voxels) == 0 or len(self._interior) == 0:
             return np.zeros(len(voxels), dtype=bool)
         low = voxels.min(axis=0)
@@ -239,7 +241,7 @@ class RecordedActions:
 
 
 def _push(probe: Probe) -> tuple[FloatArray, float]:
-    """Where the push of a probe begins, a pose (4, 4), and how far it goes, metres."""
+    """Return where the push of a probe begins, a pose (4, 4), and how far it goes, metres."""
     path = probe.gripper_path
     if len(path) < 2:
         raise SessionError(
@@ -260,7 +262,7 @@ def _push(probe: Probe) -> tuple[FloatArray, float]:
 
 
 def _interior(hand: HandShape, spacing: float, depth: float) -> FloatArray:
-    """Points (M, 3) in the hand, deeper than `depth` in one of its bodies, in its frame."""
+    """Return points (M, 3) in the hand, deeper than `depth` in one of its bodies, in its frame."""
     import trimesh
 
     mesh = trimesh.Trimesh(hand.vertices, hand.faces, process=False)

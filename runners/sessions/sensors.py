@@ -55,7 +55,7 @@ class SensorsSettings(CheckedSettings):
     """File of the true pose; None: that beside the log, if there is one; "none": unknown."""
     free_resolution: Annotated[float, positive] = 0.01  # side of a free voxel, m
     object_resolution: Annotated[float, positive] | None = None
-    """Of the object's SDF grid, m; None: by the object, see `ObjectModel.resolution`."""
+    """Spacing of the object's SDF grid, m; None: by the object, see `ObjectModel.resolution`."""
     object_padding: Annotated[float, positive] = 0.05  # of the object's SDF grid, m
     start_contacts: Annotated[int, not_negative] = 4  # a registration needs so many contacts
     start_probe: Annotated[int, not_negative] = 0  # and this index of the probe
@@ -94,9 +94,11 @@ class SensorsSource(ProbeSource):
     def __init__(
         self, settings: SensorsSettings, seed: int, *, diameter: float | None = None
     ) -> None:
-        """seed: of the choice of contact pixels. diameter: of the object, metres, where known.
+        """Open a log.
 
-        Raises SessionError for a log without use.
+        seed: of the choice of contact pixels. diameter: of the object, metres, where known.
+
+        Raise SessionError for a log without use.
         """
         path = Path(settings.path or "").expanduser()
         rig = settings.rig
@@ -231,7 +233,7 @@ class DepthFrameSource(ProbeSource):
         )
 
     def probes(self) -> Iterator[ProbeEvent]:
-        """The image, and what follows from it."""
+        """Yield the image, and the probe that follows from it."""
         found, (camera,) = self._points, self._rig.cameras
         self.report.by_probe[0] = {camera.name: found.counts}
         yield RigDescribed(-1, self._rig.name, file_digest(self._path))
@@ -248,7 +250,7 @@ class DepthFrameSource(ProbeSource):
         yield Probe(0, "points", found.points)
 
     def _remarks(self, name: str) -> Iterator[tuple[str, str]]:
-        """Levels and texts on what was left out, and on what is suspicious."""
+        """Yield levels and texts on what was left out, and on what is suspicious."""
         found, label = self._points, self._points.labelled
         for warning in self._frame.camera.check_centre():
             yield "warning", f"{name}: {warning.text}"

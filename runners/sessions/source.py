@@ -83,7 +83,7 @@ class Steerable(ProbeSource, Protocol):
 
 
 class ObjectOrigin(Enum):
-    """Where the object of a source comes from."""
+    """The origin of the object of a source."""
 
     PLACED = "the source places the run's object, by a configuration"
     REAL = "the points are those of a real object, which the run names"
@@ -104,7 +104,7 @@ class SourceKind:
     """
 
     object: ObjectOrigin
-    """Where the object comes from."""
+    """Origin of the object."""
 
     keys: Mapping[str, str] = field(default_factory=dict)
     """Values of settings in the option of Hydra, in place of those of the class."""

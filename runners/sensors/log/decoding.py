@@ -79,7 +79,7 @@ def decoder(name: str, encoding: str, definition: str | None = None) -> Decode:
 
 
 def _checked(name: str, read: Callable[[Any], Any], given: Any) -> Any:
-    """What `read` returns; as UnusableMessage what it raises, which libraries do as they like."""
+    """Return what `read` returns, or its exception as UnusableMessage; libraries raise anything."""
     try:
         return read(given)
     except UnusableMessage as error:
@@ -92,7 +92,7 @@ def _checked(name: str, read: Callable[[Any], Any], given: Any) -> Any:
 def _reader(
     name: str, encoding: str, definition: str | None
 ) -> tuple[Callable[[bytes], Any], Read]:
-    """What parses messages of a schema, and what reads their content."""
+    """Return what parses messages of a schema, and what reads their content."""
     short = name.replace("/msg/", "/")
     if encoding == "cdr" and short in _ROS2:
         return _ros2_parser(short, definition), _ROS2[short]
@@ -122,7 +122,7 @@ def _ros2_parser(name: str, definition: str | None) -> Callable[[bytes], Any]:
 
 
 def _header(message: Any) -> tuple[int | None, str]:
-    """The time stamp, nanoseconds, None where there is none, and the frame of a message."""
+    """Return the stamp, nanoseconds, None where there is none, and the frame of a message."""
     if hasattr(message, "header"):  # of ROS 2
         time, frame = message.header.stamp, message.header.frame_id
         stamp = time.sec * _NANOSECONDS + time.nanosec
@@ -136,7 +136,7 @@ def _header(message: Any) -> tuple[int | None, str]:
 
 
 def _frame_name(name: str) -> str:
-    """The name of a frame without the slash that old programs put ahead."""
+    """Return the name of a frame without the slash that old programs put ahead."""
     return one_line(name.removeprefix("/"))
 
 
@@ -271,12 +271,12 @@ def _log(message: Any, _: str) -> str:
 
 
 def _pair(message: Any, _: str) -> str:
-    """A key "begin" with value "3" is the text "begin 3"."""
+    """Return key and value as a text, such as "begin 3" of "begin" and "3"."""
     return one_line(f"{message.key} {message.value}")
 
 
 def rigid(position: Any, quaternion: Any) -> FloatArray:
-    """The transform (4, 4) of a position x, y, z, metres, and a quaternion of any length."""
+    """Return the transform (4, 4) of x, y, z, metres, and a quaternion of any length."""
     numbers = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     place = position.x, position.y, position.z
     largest = max(map(abs, numbers))
@@ -297,7 +297,7 @@ def rigid(position: Any, quaternion: Any) -> FloatArray:
 
 
 def _positions(points: Iterable[Any]) -> FloatArray:
-    """Points (N, 3) of objects that have x, y and z."""
+    """Return points (N, 3) of objects that have x, y and z."""
     return np.array([(p.x, p.y, p.z) for p in points]).reshape(-1, 3)
 
 
@@ -310,7 +310,9 @@ def packed_points(
     row: int,
     big_endian: bool = False,
 ) -> FloatArray:
-    """Points (N, 3) of `stride` bytes each; size: points a row, and rows of `row` bytes.
+    """Return points (N, 3) of `stride` bytes each, in rows.
+
+    size: points a row, and rows of `row` bytes.
 
     fields: offset in bytes and type by name.
     """

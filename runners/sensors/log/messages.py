@@ -37,13 +37,13 @@ class CameraInfoMessage:
     noun: ClassVar[str] = "camera infos"
 
     camera: PinholeCamera
-    """Of its images as they were taken: K."""
+    """Intrinsics K, of its images as they were taken."""
 
     distorted: bool = False
     """Whether lens distortion was left in its images as they were taken."""
 
     rectified: PinholeCamera | None = None
-    """Of rectified images: P."""
+    """Intrinsics P, of rectified images."""
 
 
 @dataclass(frozen=True, eq=False)
