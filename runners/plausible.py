@@ -90,7 +90,7 @@ def main(config: DictConfig) -> None:
                     "local": int(found.local.sum()),
                     "true_cost": found.true_cost,
                     "seconds": "found" if was_there else time.perf_counter() - begun,
-                    **metrics.compute(problem, found, source.problems.found(step)),
+                    **metrics.compute(problem, found, source.problems.hypotheses(step)),
                 }
             )
     shown = [key for key in _COLUMNS if any(key in row for row in rows)]

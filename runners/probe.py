@@ -32,8 +32,10 @@ from runners.command.program import command, plain, require_used
 from runners.run.display import Display, compiling_line
 from runners.run.grasps import Grasps
 from runners.run.recording import make_run_folder, write_in_run_folder
-from runners.run.scene import GRID, PROBED_BY_US, ProbeConfig, Scene, open_scene, session_started
+from runners.run.scene import GRID, ProbeConfig, Scene, open_scene, session_started
 from runners.run.session_run import Row, steps
+from runners.sessions import kinds_of, source_kind
+from runners.sessions.source import ObjectOrigin
 
 
 @command("probe")
@@ -45,7 +47,7 @@ def main(config: DictConfig) -> None:
     method_config, kind = dict(checked.method), checked.session.get("kind")
     method_name = str(method_config.pop("name", None))
     title = f"{kind} session, {method_name}, preset {checked.preset.name}, seed {checked.seed}"
-    if kind != "recorded":  # whose object is known once it is read
+    if source_kind(kind).object is not ObjectOrigin.RECORDED:  # that is known once it is read
         title = f"{checked.object.name}, {title}"
     display = Display(title)
     if why := _default_because():
@@ -61,7 +63,7 @@ def main(config: DictConfig) -> None:
             warm_up(method)
             if scene.policy is not None:
                 warm_up_policy(scene.policy)
-            if kind == "sensors":
+            if scene.report is not None:  # of sensors
                 warm_up_sensing()
         folder = make_run_folder(Path(checked.logs) / "probe", scene.object_name, method_name)
         write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
@@ -83,7 +85,9 @@ def main(config: DictConfig) -> None:
 
 def _require_used_settings(config: ProbeConfig) -> None:
     """Raise SettingError for a setting that would change nothing, as another choice is made."""
-    kind, recording = config.session.get("kind"), config.recording
+    kind = config.session.get("kind")
+    origin = source_kind(kind).object
+    recording = config.recording
     if config.policy.get("name") == GRID:
         reason = "without policy=NAME, or with grid, a session probes in its own order"
         require_used("policy.", reason=reason, accepted="policy=expected_loss, or another, with it")
@@ -91,11 +95,11 @@ def _require_used_settings(config: ProbeConfig) -> None:
         starts = (f"session.{name}" for name in ("start_contacts", "start_probe"))
         reason = "a session with a policy registers from its first contact on"
         require_used(*starts, reason=reason, accepted="policy=grid with it")
-    if kind == "recorded":
+    if origin is ObjectOrigin.RECORDED:
         reason, accepted = "a recorded session brings its own object", "another session with it"
         require_used("object", "configuration", reason=reason, accepted=accepted)
-    elif kind not in PROBED_BY_US:
-        accepted = "session=simulated or kinematic with it"
+    elif origin is not ObjectOrigin.PLACED:
+        accepted = f"session={' or '.join(kinds_of(ObjectOrigin.PLACED))} with it"
         reason = f"a session of kind {kind} has its own place of the object"
         require_used("configuration", "object.configuration", reason=reason, accepted=accepted)
     if config.grasp.path is None:
@@ -151,7 +155,7 @@ def run_session(
     display: Display,
 ) -> bool:
     """Run the session to its end or to Ctrl-C; return whether it was interrupted."""
-    if started.session == "recorded":
+    if scene.session.recorded is not None:
         display.say(f"object: {started.object}")
     policy = scene.policy
     display.probes(scene.session.count if policy is None else policy.settings.probes)

@@ -36,7 +36,7 @@ from runners.published_package.process import (
     RefusedError,
     interpreter,
 )
-from runners.sessions.recorded import RecordedSession, RecordedSettings
+from runners.sessions.recorded import RecordedSettings, RecordedSource
 
 HOW = replace(in_preset(OnlineSettings(), "reference"), initial="so3")
 """E_0 and E_l as the package's authors make them, but first from the starts that all others get."""
@@ -162,7 +162,7 @@ class PackageSession:
 
     def register(self) -> Iterator[int]:
         """Yield each step when the package is done with it; the files exist at the end."""
-        session = RecordedSession(RecordedSettings(str(self.session), 0, 0))
+        session = RecordedSource(RecordedSettings(str(self.session), 0, 0))
         arrays: dict[str, Any] = {}
         about: dict[str, Any] = {"failed": {}, "cpu_seconds": {}, "free_points": {}}
 

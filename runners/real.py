@@ -41,7 +41,7 @@ from runners.reporting.tables import Table, print_table, table_of
 from runners.run.display import compiling_line
 from runners.run.scene import PresetName
 from runners.sensors.depth_frame import SUFFIXES as FRAMES
-from runners.sessions.problem_source import open_source
+from runners.sessions.problem_file import open_problem_file
 
 MADE = "made.json"
 """Name of the file beside results.csv that says how that was made."""
@@ -126,7 +126,7 @@ class RealCase:
         model |= {"kind": "file", "path": str(folder / case.mesh)}
         frame = Path(case.path).suffix.lower() in FRAMES
         session = {"kind": "sensors", "rig": config.rig} if frame else {"kind": "points"}
-        self._source = open_source(folder / case.path, model, session, folder, 0)
+        self._source = open_problem_file(folder / case.path, model, session, folder, 0)
         self._given = self._source.problems.problem(self._source.steps[-1])
         self._touches = self._given.points.contacts
         if len(self._touches) < 2:

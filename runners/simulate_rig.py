@@ -24,7 +24,7 @@ from runners.simulated_robot.simulation import Push, simulate_log
 
 ConfigStore.instance().store("robot", settings_mapping(RobotSettings()), package="_global_")
 EPSILON = 0.001  # m: that of an object which no configuration file describes; unused here
-_STOPS = {"pads": "felt by the pads", "hand": "stopped by the hand", "end": "nothing touched"}
+_STOPS = {"pads": "stopped by the pads", "hand": "stopped by the hand", "end": "nothing touched"}
 
 
 @dataclass(frozen=True)

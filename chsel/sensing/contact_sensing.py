@@ -25,10 +25,10 @@ _PARALLEL = 1e-12  # of the product of two lengths
 def deformation(
     reference: FloatArray, depth: FloatArray, *, valid: BoolArray | None = None
 ) -> FloatArray:
-    """How far (H, W), in metres, a membrane is pressed towards its camera.
+    """Return how far (H, W), in metres, a membrane is pressed towards its camera.
 
     reference (H, W): depths of the untouched membrane. depth (H, W): depths now. 0 where either is
-    missing (0, negative, not finite) or is not `valid` (H, W). Raises PointsError for shapes that
+    missing (0, negative, not finite) or is not `valid` (H, W). Raise PointsError for shapes that
     differ.
     """
     reference, depth = np.asarray(reference, np.float64), np.asarray(depth, np.float64)
@@ -44,7 +44,7 @@ def deformation(
 
 
 def smooth(image: FloatArray, side: int) -> FloatArray:
-    """The image (H, W) under a mean filter of side x side pixels; borders are reflected.
+    """Return the image (H, W) under a mean filter of side x side pixels; borders are reflected.
 
     An even side reaches one pixel further up and left than down and right. Values that are not
     finite count as 0; otherwise they would spread over their row and column.
@@ -57,7 +57,7 @@ def smooth(image: FloatArray, side: int) -> FloatArray:
 def contact_mask(
     deformation: FloatArray, *, quantile: float, threshold: float, valid: BoolArray | None = None
 ) -> BoolArray:
-    """Pixels (H, W) in contact: deformed by more than a quantile of all and by over `threshold` m.
+    """Return pixels (H, W) in contact: deformed above a quantile of all and `threshold` m.
 
     valid (H, W): pixels that count; None: all.
     """
@@ -69,7 +69,7 @@ def contact_mask(
 
 
 def contact_subset(count: int, most: int, stream: np.random.Generator) -> IntArray:
-    """Ascending indices of at most `most` out of `count` pixels, every subset equally likely.
+    """Return ascending indices of at most `most` of `count` pixels; all subsets are equally likely.
 
     All of them, without drawing from the stream, if there are no more than that.
     """
@@ -79,7 +79,7 @@ def contact_subset(count: int, most: int, stream: np.random.Generator) -> IntArr
 
 
 def share(counts: Sequence[int], most: int) -> list[int]:
-    """How many of at most `most` points each camera gets, in proportion to its count.
+    """Return how many of at most `most` points each camera gets, in proportion to its count.
 
     They sum to `most`, or to all points if these are fewer. The remainders of the division go to
     the cameras with the largest fractions, to the first among equals.
@@ -103,7 +103,7 @@ class ForceContact(NamedTuple):
 
 
 def contact_on_axis(force: FloatArray, torque: FloatArray, triangles: FloatArray) -> ForceContact:
-    """The point of a body's surface where the line of a force that acts on the body enters it.
+    """Return the point of a body's surface where the line of a force on the body enters it.
 
     force (3,): newtons, not 0. torque (3,): newton metres about the origin. triangles (F, 3, 3):
     of closed bodies that may overlap, wound counter-clockwise as seen from outside, metres, in the
@@ -128,7 +128,7 @@ def contact_on_axis(force: FloatArray, torque: FloatArray, triangles: FloatArray
 
 
 def contact_ahead(force: FloatArray, triangles: FloatArray) -> ForceContact:
-    """The point of a body that is furthest against a force on it, where no torque is known.
+    """Return the point of a body that is furthest against a force on it, without any torque.
 
     force (3,): newtons, not 0. triangles (F, 3, 3): metres. The mean of the vertices that lie
     within 1 mm of the furthest one, such as the middle of a face that meets the object squarely.
@@ -146,7 +146,7 @@ def _nearest_edge(
     edges: FloatArray,
     normals: FloatArray,
 ) -> ForceContact:
-    """The point on edges (F, 3, 3) that is nearest to a line."""
+    """Return the point on edges (F, 3, 3) that is nearest to a line."""
     from_line = triangles - start
     from_line = from_line - (from_line * way).sum(axis=-1, keepdims=True) * way
     across = edges - (edges * way).sum(axis=-1, keepdims=True) * way

@@ -1,4 +1,4 @@
-"""Pinhole cameras, which pixels of a depth image are reliable, and regions that belong together."""
+"""Pinhole cameras, reliable pixels of depth images, and regions that belong together."""
 
 from __future__ import annotations
 
@@ -71,19 +71,12 @@ class PinholeCamera:
 
     @classmethod
     def of_matrix(cls, matrix: Any, width: int, height: int) -> PinholeCamera:
-        """The camera of a matrix (3, 3). Raises SettingError for one that is not a pinhole's."""
-        matrix = frozen("camera", matrix, (3, 3), error=SettingError)
-        fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        off = matrix - np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        if np.abs(off).max() > _MATRIX_ROUNDING * max(abs(fx), 1.0):
-            raise SettingError(
-                f"camera is {quoted(matrix.tolist())}, not a pinhole camera's matrix; accepted: "
-                "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] by rows, pixels"
-            )
-        return cls(width, height, fx, fy, cx, cy)
+        """Return the camera of a matrix (3, 3). Raise SettingError if it is not a pinhole's."""
+        fx, fy, cx, cy = matrix_numbers(matrix)
+        return cls(width, height, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def check_centre(self) -> list[InputWarning]:
-        """A warning if the principal point is likely that of another image, or cx and cy swapped.
+        """Return a warning if the principal point is another image's, or cx and cy are swapped.
 
         That is, outside of the image, or far from its centre and much nearer to it when swapped.
         """
@@ -112,13 +105,13 @@ class PinholeCamera:
         return (np.arange(self.height, dtype=np.float64) - self.cy) / self.fy
 
     def directions(self) -> FloatArray:
-        """Where each pixel looks (H, W, 3) in the camera frame, with z = 1."""
+        """Return where each pixel looks (H, W, 3) in the camera frame, with z = 1."""
         return self.back_project(np.ones((self.height, self.width)))
 
     def back_project(self, depth: Any) -> FloatArray:
-        """Points (H, W, 3) in the camera frame, metres, of depths (H, W) along z.
+        """Return points (H, W, 3) in the camera frame, metres, of depths (H, W) along z.
 
-        Depths that are not finite give such points. Raises PointsError for another shape.
+        Depths that are not finite give such points. Raise PointsError for another shape.
         """
         depth = self.image("depth", depth)
         with np.errstate(invalid="ignore"):  # 0 times infinity
@@ -126,7 +119,7 @@ class PinholeCamera:
         return np.stack([x, y, depth], axis=-1)
 
     def image(self, name: str, values: Any, dtype: Any = np.float64) -> np.ndarray:
-        """Values (H, W) as an array. Raises PointsError for another shape."""
+        """Return values (H, W) as an array. Raise PointsError for another shape."""
         values = np.asarray(values, dtype=dtype)
         if values.shape != (self.height, self.width):
             raise PointsError(
@@ -136,8 +129,29 @@ class PinholeCamera:
         return values
 
 
+def matrix_numbers(
+    matrix: Any, *, skew: float = _MATRIX_ROUNDING
+) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx and cy, pixels, of a camera's matrix (3, 3).
+
+    skew: the largest that is left out, of the focal length. Raise SettingError for a matrix that is
+    not a pinhole camera's.
+    """
+    matrix = frozen("camera", matrix, (3, 3), error=SettingError)
+    fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    off = np.abs(matrix - np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
+    most = np.full((3, 3), _MATRIX_ROUNDING)
+    most[0, 1] = skew
+    if (off > most * max(abs(fx), 1.0)).any():
+        raise SettingError(
+            f"camera is {quoted(matrix.tolist())}, not a pinhole camera's matrix; accepted: "
+            "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] by rows, pixels"
+        )
+    return fx, fy, cx, cy
+
+
 def valid_pixels(depth: FloatArray, *, nearest: float, furthest: float) -> BoolArray:
-    """Whether pixels (H, W) have a depth from nearest to furthest, metres.
+    """Return whether pixels (H, W) have a depth from nearest to furthest, metres.
 
     Cameras mark pixels without a measurement by 0, NaN, infinity or a negative number.
     """
@@ -148,7 +162,7 @@ def valid_pixels(depth: FloatArray, *, nearest: float, furthest: float) -> BoolA
 def occlusion_edges(
     depth: FloatArray, valid: BoolArray, jump: float, *, reach: int = 1
 ) -> BoolArray:
-    """Pixels (H, W) that differ by more than `jump` metres from one of their neighbours.
+    """Return pixels (H, W) that differ by more than `jump` metres from one of their neighbours.
 
     On both sides of the jump, as either may be wrong. depth (H, W): metres. valid (H, W): pixels
     that count, all finite. reach: the distance in pixels, along rows and columns, up to which a
@@ -161,7 +175,7 @@ def occlusion_edges(
 
 
 def _least_around(image: FloatArray, reach: int) -> FloatArray:
-    """The least (H, W) of the pixels up to `reach` away from each, along rows and columns."""
+    """Return the least (H, W) of the pixels up to `reach` from each, along rows and columns."""
     return minimum_filter(image, 2 * reach + 1, mode="constant", cval=np.inf)
 
 
@@ -176,7 +190,7 @@ class MainRegions(NamedTuple):
 def depth_regions(
     depth: FloatArray, counts: BoolArray, camera: PinholeCamera, jump: float
 ) -> IntArray:
-    """The region (H, W) of each pixel of a depth image, from 1; 0 for pixels that do not count.
+    """Return the region (H, W) of each pixel of a depth image, from 1; 0 where none counts.
 
     Pixels that share a side are connected unless their depths, metres along z, jump: differ by
     more than `jump` times the depth, besides what a surface steeply inclined to the ray explains.
@@ -192,7 +206,7 @@ def depth_regions(
 
 
 def point_regions(points: FloatArray, gap: float) -> IntArray:
-    """The region (N,) of each of points (N, 3), finite, metres; from 1.
+    """Return the region (N,) of each of points (N, 3), finite, metres; from 1.
 
     Points up to `gap` metres apart are connected, or up to four times the typical distance between
     neighbours where that is more. Points more than 3.5 times as far apart are not.
@@ -241,7 +255,7 @@ def main_regions(
 
 
 def small_regions(regions: IntArray, least: int) -> BoolArray:
-    """Pixels (H, W) in regions of fewer than `least` pixels."""
+    """Return pixels (H, W) in regions of fewer than `least` pixels."""
     small = np.bincount(regions.reshape(-1)) < least
     small[0] = False
     return np.asarray(small[regions])
@@ -250,7 +264,7 @@ def small_regions(regions: IntArray, least: int) -> BoolArray:
 def speckle_free(
     depth: FloatArray, valid: BoolArray, regions: IntArray, least: int
 ) -> tuple[FloatArray, int]:
-    """Depths (H, W) up to which rays are free, and how many pixels are in regions too small.
+    """Return depths (H, W) up to which rays are free, and how many pixels are in small regions.
 
     Pixels in regions of fewer than `least` pixels have the least depth of all valid ones (H, W)
     around them, so far that some are not of their region: if those are right, no ray is too long.
@@ -261,13 +275,13 @@ def speckle_free(
 
 
 def _linked(one: FloatArray, other: FloatArray, share: float) -> BoolArray:
-    """Whether pairs of depths are connected; none is with 0."""
+    """Return whether pairs of depths are connected; none is with 0."""
     nearer = np.minimum(one, other)
     return (nearer > 0.0) & (np.abs(one - other) <= share * nearer)
 
 
 class DepthLook(NamedTuple):
-    """What a depth image shows."""
+    """Free rays and surface points of a depth image."""
 
     camera: PinholeCamera
     pose: FloatArray  # (4, 4), world_from_camera
@@ -286,11 +300,11 @@ def depth_look(
     before: float,
     side: float,
 ) -> DepthLook:
-    """The free rays of a depth image, and points of what a mask (H, W) says is the object.
+    """Return the free rays of a depth image, and points of what a mask (H, W) says is the object.
 
     before: metres that rays end before what they see. side: of voxels of which each gives one point
     at most, metres. Pixels beside jumps of depth, at the mask's outline and in its small regions
-    are left out. Raises PointsError for an image without a depth, or a mask without a pixel left.
+    are left out. Raise PointsError for an image without a depth, or a mask without a pixel left.
     """
     pose = frozen(
         "world_from_camera", world_from_camera, (4, 4), error=PoseError, most=FARTHEST_PLACE
@@ -333,7 +347,7 @@ def depth_look(
 
 
 def one_per_voxel(points: FloatArray, side: float) -> FloatArray:
-    """Of points (N, 3), those nearest to the centre of their voxel (M, 3), in the given order."""
+    """Return those of points (N, 3) nearest to the centre of their voxel (M, 3), in their order."""
     lattice = Lattice((0.0, 0.0, 0.0), side)
     voxels = lattice.voxels(points)
     distance = ((points - lattice.centres(voxels)) ** 2).sum(axis=1)
@@ -343,7 +357,7 @@ def one_per_voxel(points: FloatArray, side: float) -> FloatArray:
 
 
 def outside_of(on_object: FloatArray, free: FloatArray, spacing: float) -> FloatArray:
-    """Free centres (N, 3) but for those that a measured surface point can lie behind.
+    """Return free centres (N, 3) but for those that a measured surface point can lie behind.
 
     A ray that passes a voxel passes its centre at up to half the voxel's diagonal, so that nearer
     to the surface than this a centre may be inside the object.

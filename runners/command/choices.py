@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import MISSING, asdict, fields, is_dataclass
 from functools import cache, partial
@@ -23,10 +23,10 @@ from runners.objects.scans import URL
 from runners.run.grasps import GraspConfig
 from runners.run.recording import RecordingConfig
 from runners.sensors.rig import Rig
-from runners.sessions import SESSIONS
+from runners.sessions import KINDS, kinds_of
 from runners.sessions.configurations import FITTED
-from runners.sessions.faults import CLEAN, LEVELS
-from runners.sessions.probing_settings import ProbingSettings
+from runners.sessions.faults import LEVELS
+from runners.sessions.source import ObjectOrigin
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 _OWN_GROUPS = ("presets", "rig", "faults")  # not options of the group around them
@@ -36,7 +36,7 @@ def calls_for_anchored(session: str, policy: str) -> str:
     """Return the choice, as typed, that makes `default_method` the default of method=, or ""."""
     if policy != "grid":
         return f"policy={policy}"
-    return f"session={session}" if session in ("points", "sensors") else ""
+    return f"session={session}" if session in kinds_of(ObjectOrigin.REAL) else ""
 
 
 def _method(session: str, policy: str, preset: str) -> str:
@@ -79,17 +79,14 @@ def store_choices() -> None:
 
 def _store_sessions() -> None:
     """Store sessions. session/presets/rig/default has all keys of a rig, to be changed by name."""
-    for kind in ("simulated", "kinematic"):  # in PyBullet, and by geometry without an engine
-        # configuration: a key of the top file, for short commands
-        node = {"kind": kind, "configuration": "${configuration}"}
-        settings = partial(in_preset, ProbingSettings())
-        _store_with_presets("session", kind, settings, node, {"faults": CLEAN})
-    for kind, settings_class in SESSIONS.items():
-        if settings_class is not ProbingSettings:
-            values: dict[str, Any] = {"kind": kind, **_defaults(settings_class)}
-            if kind == "sensors":
-                values["defaults"] = [{"presets/rig@rig": "default"}, {"rig": "cabinet"}, "_self_"]
-            store("session", kind, values)
+    for name, kind in KINDS.items():
+        node: dict[str, Any] = {"kind": name, **kind.keys}
+        if hasattr(kind.settings, "presets"):
+            settings = partial(in_preset, kind.settings())
+            _store_with_presets("session", name, settings, node, *kind.groups)
+        else:
+            defaults = {"defaults": [*kind.groups, "_self_"]} if kind.groups else {}
+            store("session", name, _defaults(kind.settings) | node | defaults)
     for level, faults in LEVELS.items():
         store("session/faults", level, settings_mapping(faults))
     rig = settings_mapping(Rig(name="", world=""))  # what a rig's file leaves out
@@ -113,7 +110,7 @@ def _store_with_presets(
     name: str,
     settings: Callable[[str], Any],
     node: dict[str, Any],
-    *choices: dict[str, str],
+    *choices: Mapping[str, str],
 ) -> None:
     """Store GROUP/NAME: settings in the chosen preset, one of GROUP/presets/NAME/PRESET.
 

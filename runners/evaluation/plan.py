@@ -26,10 +26,12 @@ from runners.evaluation.trial_configurations import (
     recorded_object,
 )
 from runners.objects.loader import ObjectConfig
-from runners.sessions import session_settings
+from runners.sessions import kinds_of, session_settings
 from runners.sessions.faults import CLEAN, LEVELS, level_name
+from runners.sessions.probing_settings import ProbingSettings
+from runners.sessions.source import ObjectOrigin
 
-SESSIONS = ("simulated", "kinematic", SENSORS)
+SESSIONS = (*kinds_of(ObjectOrigin.PLACED), SENSORS)
 OWN = "own"
 OBJECTS = {"models": "", "scans": "ycb/"}  # before the names of objects, by what they are
 
@@ -129,7 +131,8 @@ class Plan:
 
     def faults(self, trial: Trial) -> str:
         """Return the name of the level of faults in a trial's session."""
-        return level_name(getattr(self.session_settings(trial), "faults", LEVELS[CLEAN]))
+        settings = self.session_settings(trial)
+        return level_name(settings.faults) if isinstance(settings, ProbingSettings) else CLEAN
 
     def plausible_settings(self, epsilon: float) -> PlausibleSettings:
         """Return the definition of the plausible sets of an object of this epsilon, metres."""

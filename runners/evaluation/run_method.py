@@ -40,7 +40,7 @@ from runners.evaluation.trial_session import (
     read_told,
 )
 from runners.run.session_run import steps
-from runners.sessions.recorded import RecordedSession
+from runners.sessions.recorded import RecordedSource
 
 REPEAT_FOLDER = "draw_{}"
 """Where further sets of the same sessions are, in the folder of the first ones."""
@@ -54,7 +54,7 @@ class ResultRows:
     """Makes rows of the table of what was found at the steps of a trial."""
 
     def __init__(
-        self, plan: Plan, trial: Trial, session: RecordedSession, label: str, holds: Any = None
+        self, plan: Plan, trial: Trial, session: RecordedSource, label: str, holds: Any = None
     ) -> None:
         """Measure a session with faults by the plausible sets of the same probes without any.
 

@@ -34,8 +34,8 @@ from runners.run.scene import (
     open_scene,
     session_started,
 )
-from runners.sessions.problem_source import ProbedProblems
-from runners.sessions.recorded import RecordedSession, RecordedSettings
+from runners.sessions.problem_file import ProbedProblems
+from runners.sessions.recorded import RecordedSettings, RecordedSource
 
 TRUTH = "truth"
 """Key of the configuration under which stands how a true pose was found."""
@@ -166,21 +166,21 @@ def read_told(folder: Path) -> dict[str, Any]:
     return dict(json.loads((folder / "session.json").read_text()))
 
 
-def open_recorded(plan: Plan, trial: Trial) -> RecordedSession:
+def open_recorded(plan: Plan, trial: Trial) -> RecordedSource:
     """Return the session of a trial, from its recording."""
     path, settings = trial.folder(plan) / "session.mcap", plan.session_settings(trial)
     start = settings.start_contacts, settings.start_probe
-    return RecordedSession(RecordedSettings(str(path), *start))
+    return RecordedSource(RecordedSettings(str(path), *start))
 
 
-def plausible_settings_of(plan: Plan, session: RecordedSession) -> PlausibleSettings:
+def plausible_settings_of(plan: Plan, session: RecordedSource) -> PlausibleSettings:
     """Return the definition of the plausible sets of a session."""
     config = session.recorded.config["object"]
     return plan.plausible_settings(float(config["epsilon"]))
 
 
 def problems(
-    plan: Plan, trial: Trial, session: RecordedSession, settings: OnlineSettings = _ONE
+    plan: Plan, trial: Trial, session: RecordedSource, settings: OnlineSettings = _ONE
 ) -> Iterator[RegistrationProblem]:
     """Yield the problem of every step with a registration; none follows from a result."""
     loop = session.loop(settings, seed=trial.seed, steps=plan.steps_of(trial.configuration))

@@ -25,7 +25,7 @@ from runners.evaluation.plan import Plan, Trial
 from runners.objects.loader import load_object
 from runners.objects.scans import AssetsConfig
 from runners.sensors.pose_file import SUFFIX, beside, read_pose, write_pose
-from runners.sessions.problem_source import Source, is_recording, open_source
+from runners.sessions.problem_file import ProblemFile, is_recording, open_problem_file
 from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
 from runners.simulated_robot.settings import RobotSettings
 
@@ -61,13 +61,15 @@ class SourceConfig(CheckedSettings):
         """Return the folder to write to."""
         return Path(self.out).expanduser() if self.out else usual
 
-    def open(self) -> Source:
-        """Return the session of the file; raise SettingError for settings that it makes useless."""
+    def open(self) -> ProblemFile:
+        """Return the content of the file; raise SettingError for settings that it makes useless."""
         if is_recording(self.path):
             accepted = "a raw log or known points with it"
             reason = f"the recording {self.path} brings its own object and points"
             require_used("object", "session", "session/rig", reason=reason, accepted=accepted)
-        return open_source(self.path, self.object, self.session, self.assets.folder, self.seed)
+        return open_problem_file(
+            self.path, self.object, self.session, self.assets.folder, self.seed
+        )
 
 
 def sought_pose(

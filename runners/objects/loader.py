@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Protocol
 
 import numpy as np
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ObjectConfig(CheckedSettings):
-    """Which object, and how large."""
+    """An object and its scale."""
 
     name: str
     scale: Annotated[float, positive]  # multiplies the mesh into the metres of the session
@@ -69,29 +69,41 @@ OBJECTS = {name: ObjectConfig(name, *trial) for name, trial in _TRIALS.items()} 
 PAPER_RESOLUTION = 0.010  # m: of the SDF grids of these in the paper's simulated trials
 
 
+class GridSettings(Protocol):
+    """Settings of a source for which the object is loaded."""
+
+    @property
+    def object_resolution(self) -> float | None:
+        """Spacing of the object's SDF grid, metres; None: by the object."""
+
+    @property
+    def object_padding(self) -> float:
+        """Padding of the object's SDF grid, metres."""
+
+
 @dataclass(frozen=True, eq=False)
 class ObjectModel:
-    """An object as a session sees it: its mesh in metres, with the scale already applied."""
+    """An object as a source sees it: its mesh in metres, with the scale already applied."""
 
-    name: str
-    mesh: trimesh.Trimesh
-    scale: float
-    epsilon: float
-    configuration: str
+    name: str  # as its choice is called
+    mesh: trimesh.Trimesh  # in its own frame, metres
+    scale: float  # applied to the mesh
+    epsilon: float  # tolerance of the plausible set, metres
+    configuration: str  # by which simulated sources place and probe it, unless settings name one
     of_paper: bool = False  # one of the paper's simulated trials, at its scale there
     _grids: dict[tuple[float | None, float], SdfGrid] = field(default_factory=dict, repr=False)
 
-    def resolution(self, settings: Any) -> float | None:
-        """Spacing in metres of the SDF grid that a session's settings ask for.
+    def resolution(self, settings: GridSettings) -> float | None:
+        """Return the spacing in metres of the SDF grid that settings ask for.
 
         Where they leave it open, an object of the paper's trials has that of the paper, and every
         other that of `object_grid`, which None stands for.
         """
-        chosen: float | None = settings.object_resolution
+        chosen = settings.object_resolution
         return PAPER_RESOLUTION if chosen is None and self.of_paper else chosen
 
-    def grid(self, settings: Any) -> SdfGrid:
-        """The signed distance grid that a session's settings ask for, made once."""
+    def grid(self, settings: GridSettings) -> SdfGrid:
+        """Return the signed distance grid that settings ask for, made once."""
         resolution, padding = self.resolution(settings), settings.object_padding
         if (resolution, padding) not in self._grids:
             grid = object_grid(self.mesh, resolution, padding=padding)
@@ -105,9 +117,9 @@ class ObjectModel:
 
 
 def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:
-    """The object that `config` names; scans come from the folder `assets`.
+    """Return the object that `config` names; scans come from the folder `assets`.
 
-    Raises SettingError for an unknown model, MeshError if the mesh is missing or unusable.
+    Raise SettingError for an unknown model, MeshError if the mesh is missing or unusable.
     """
     if config.kind == "file":
         mesh = load_mesh(config.path or "", scale=config.scale)
@@ -126,13 +138,13 @@ def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:
 
 
 def _of_paper(config: ObjectConfig) -> bool:
-    """Whether an object is one of the paper's simulated trials, at its scale there."""
+    """Return whether an object is one of the paper's simulated trials, at its scale there."""
     shipped = config.kind == "model" or SCANS.get(config.scan or "") == config.name
     return shipped and config.kind != "file" and config.scale == _TRIALS[config.name][0]
 
 
 def check_size(model: ObjectModel, workspace: Workspace) -> list[MeshWarning]:
-    """A warning for an object that is enlarged, or longer than the workspace.
+    """Return a warning for an object that is enlarged, or longer than the workspace.
 
     The objects of simulated sessions are enlarged by default; given points are of real ones.
     """
@@ -148,6 +160,6 @@ def check_size(model: ObjectModel, workspace: Workspace) -> list[MeshWarning]:
 
 
 def load_model(name: str, scale: float = 1.0) -> trimesh.Trimesh:
-    """One of MODELS in the frame of its YCB mesh; metres at scale 1."""
+    """Return one of MODELS in the frame of its YCB mesh; metres at scale 1."""
     require_choice("object.name", name, MODELS)
     return load_mesh(Path(__file__).parent / "models" / f"{name}.ply", scale=scale)

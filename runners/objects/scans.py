@@ -37,7 +37,7 @@ class DownloadError(ChselError):
 
 @dataclass(frozen=True)
 class AssetsConfig:
-    """Where scans lie, and where they come from."""
+    """The folder of scans, and the address of their downloads."""
 
     dir: str  # the folder; ~ is the home folder
     url: str  # address of the folder of the official archives
@@ -48,19 +48,19 @@ class AssetsConfig:
         return Path(self.dir).expanduser()
 
     def archive_url(self, scan: str) -> str:
-        """Address of the official archive of a scan."""
+        """Return the address of the official archive of a scan."""
         return f"{self.url.rstrip('/')}/{scan}_{RESOLUTION}.tgz"
 
 
 def scan_folder(assets: Path, scan: str) -> Path:
-    """Where the scan with the official folder name `scan` lies, as in the official archives."""
+    """Return the folder of the scan with the official folder name `scan`, as in the archives."""
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", scan):
         raise SettingError(f"object.scan is {scan!r}; accepted: a name such as 035_power_drill")
     return assets / scan / RESOLUTION
 
 
 def scan_file(assets: Path, scan: str) -> Path:
-    """The mesh file of a scan; MeshError, with what to run, if it is not there."""
+    """Return the mesh file of a scan. Raise MeshError, with what to run, if it is not there."""
     path = scan_folder(assets, scan) / MESH_FILE
     if not path.is_file():
         choice = f"ycb/{SCANS[scan]}" if scan in SCANS else f"ycb/drill object.scan={scan}"
@@ -74,7 +74,7 @@ def scan_file(assets: Path, scan: str) -> Path:
 def download_scan(scan: str, assets: AssetsConfig) -> str:
     """Download a scan and place it; what it is, in one line.
 
-    Of the archive only the mesh is unpacked. Raises DownloadError, and leaves nothing, if the
+    Of the archive only the mesh is unpacked. Raise DownloadError, and leave nothing, if the
     archive cannot be had or has no closed mesh of the scan.
     """
     import pooch

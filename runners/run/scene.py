@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from chsel.errors import InputWarning, SessionError
@@ -23,19 +23,15 @@ from runners.objects.scans import AssetsConfig
 from runners.run.grasps import GraspConfig
 from runners.run.recording import RecordingConfig
 from runners.sensors.session_report import Report
-from runners.sessions import open_session, session_settings
+from runners.sessions import open_source, session_settings, source_kind
 from runners.sessions.probing_settings import without_defaults
-from runners.sessions.recorded import RecordedSession
-from runners.sessions.source import ProbeSource, Steerable
+from runners.sessions.source import ObjectOrigin, ProbeSource, Steerable
 
 if TYPE_CHECKING:
     import trimesh
 
 GRID = "grid"
 """The policy of a session that is not steered: it probes in its own order."""
-PROBED_BY_US = ("simulated", "kinematic")
-"""Kinds of sessions that place the object and choose their probes themselves."""
-_OF_REAL_OBJECTS = ("points", "sensors")  # sessions whose points come from real objects
 FIRST_CONTACT = Start(contacts=1)
 """When a session with a policy begins to register."""
 _NOT_OF_THE_RESULT = ("assets", "logs", "recording", "threads")
@@ -88,12 +84,12 @@ class Scene:
     @property
     def report(self) -> Report | None:
         """What became of sensors' images, once they are read."""
-        return getattr(self.session, "report", None)
+        return self.session.report
 
     @property
     def moves(self) -> float:
         """Metres that a probe moves the object at most."""
-        return float(getattr(self.session, "push_distance", 0.0))
+        return self.session.push_distance
 
     def begin(self, run: Run, started: SessionStarted) -> None:
         """Open the recording of a run over the session, and offer the actions."""
@@ -110,51 +106,55 @@ def open_scene(config: ProbeConfig) -> Scene:
     Raises SessionError for a policy on a session whose probes cannot be chosen.
     """
     values = dict(config.session)
-    kind = str(values.pop("kind", None))
-    settings = session_settings(kind, values)
+    kind_name = str(values.pop("kind", None))
+    kind = source_kind(kind_name)
+    settings = session_settings(kind_name, values)
     values = dict(config.policy)
     policy_name = str(values.pop("name", None))
     policy = build_policy(policy_name, values)
     found: list[InputWarning] = []
-    session: ProbeSource
-    resolution: float | None = None
-    if kind == "recorded":
-        session = RecordedSession(settings)
-        of, start = session.recorded, session.start
-        name, mesh, sdf = of.object, of.mesh, of.sdf
+    if kind.object is ObjectOrigin.RECORDED:
+        source = open_source(kind_name, settings, None, config.seed)
+        assert source.recorded is not None
+        scene = Scene(
+            source,
+            object_name=source.recorded.object,
+            mesh=source.recorded.mesh,
+            sdf=source.recorded.sdf,
+            start=source.start,
+            warnings=tuple(source.warnings),
+        )
     else:
         with _caught() as found:
             model = load_object(config.object, config.assets.folder)
-            session = open_session(kind, settings, model, config.seed)
+            source = open_source(kind_name, settings, model, config.seed)
             sdf = model.grid(settings)
-        name, mesh, resolution = model.name, model.mesh, model.resolution(settings)
-        start = Start(contacts=settings.start_contacts, step=settings.start_probe)
-        found += getattr(session, "warnings", [])
-        if kind in _OF_REAL_OBJECTS:
-            found += check_size(model, session.workspace)
-    if policy_name == GRID:
-        return Scene(session, name, mesh, sdf, start, resolution, tuple(found))
-    if not isinstance(session, Steerable):
-        raise SessionError(
-            f"session {kind} cannot be steered, as its probes are given; accepted: policy=grid, or "
-            "session=kinematic, simulated or recorded"
+        found += source.warnings
+        if kind.object is ObjectOrigin.REAL:
+            found += check_size(model, source.workspace)
+        scene = Scene(
+            source,
+            object_name=model.name,
+            mesh=model.mesh,
+            sdf=sdf,
+            start=source.start,
+            object_resolution=model.resolution(settings),
+            warnings=tuple(found),
         )
-    return Scene(
-        session=session,
-        object_name=name,
-        mesh=mesh,
-        sdf=sdf,
-        start=FIRST_CONTACT,
-        object_resolution=resolution,
-        warnings=tuple(found),
-        policy=policy,
-        actions=session.offer(policy.settings.actions),
-    )
+    if policy_name == GRID:
+        return scene
+    if not isinstance(source, Steerable):
+        raise SessionError(
+            f"session {kind_name} cannot be steered, as its probes are given; accepted: "
+            "policy=grid, or a session that takes probes as they are chosen, such as kinematic"
+        )
+    actions = source.offer(policy.settings.actions)
+    return replace(scene, start=FIRST_CONTACT, policy=policy, actions=actions)
 
 
 @contextmanager
 def _caught() -> Iterator[list[InputWarning]]:
-    """Warnings about the object's mesh and grid, which belong into the recording."""
+    """Collect warnings about the object's mesh and grid, which belong into the recording."""
     found: list[InputWarning] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -1,4 +1,4 @@
-"""What all sensors of a robot cell share: where things are, what is free, warnings."""
+"""The robot cell that all sensors share: transforms, free space, warnings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class FreeMap:
         self.grid = FreeGrid(workspace, spacing)
 
     def new(self, contacts: FloatArray | None = None) -> FloatArray:
-        """Centres (N, 3) of the voxels that became free since the last call.
+        """Return centres (N, 3) of the voxels that became free since the last call.
 
         Left out are those less than a voxel's diagonal from contacts (C, 6) with a rigid hand,
         points and the object's outward normals, and behind them: the hand passed such a voxel, but
@@ -43,14 +43,14 @@ class FreeMap:
         return np.delete(centres, near[ahead < 0.0], axis=0)
 
     def within(self, points: FloatArray) -> BoolArray:
-        """Which of points (N, 3) lie in the workspace, or less than a voxel beside it."""
+        """Return which points (N, 3) lie in the workspace, or less than a voxel beside it."""
         margin = self.grid.lattice.spacing
         lower, upper = self.workspace.bounds
         return ((points >= lower - margin) & (points <= upper + margin)).all(axis=1)
 
 
 def is_entered(workspace: Workspace, origin: FloatArray, ends: FloatArray) -> bool:
-    """Whether more than a thousandth of segments from origin (3,) to ends (N, 3) enter it."""
+    """Return whether over a thousandth of segments from origin (3,) to ends (N, 3) enter it."""
     lower, upper = workspace.bounds
     with np.errstate(divide="ignore", invalid="ignore"):
         first, second = (lower - origin) / (ends - origin), (upper - origin) / (ends - origin)
@@ -77,7 +77,7 @@ class RobotCell:
         return self.free.grid.lattice.spacing
 
     def world_from(self, frame: str, time: int, sensor: str) -> FloatArray | None:
-        """Pose (4, 4) of a frame at a time in nanoseconds; None, with a warning, where unknown."""
+        """Return the pose (4, 4) of a frame at a time, ns; None, with a warning, if unknown."""
         try:
             return self.tree.lookup(self.world, frame, time, gap_s=self.gap)
         except TransformError:

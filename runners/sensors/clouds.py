@@ -1,8 +1,6 @@
-"""Topics of points: rays that are free, or the object's surface."""
+"""A topic of points: rays that are free, or the object's surface."""
 
 from __future__ import annotations
-
-from typing import ClassVar
 
 import numpy as np
 
@@ -11,37 +9,44 @@ from chsel.problem.points import Lattice
 from chsel.problem.poses import apply
 from chsel.sensing.depth_camera import main_regions, point_regions
 from runners.sensors.cell import RobotCell, is_entered
+from runners.sensors.first_pass import FirstPass, SensorTopic
 from runners.sensors.log.messages import CloudMessage
 from runners.sensors.rig import CloudRig
+from runners.sensors.sensor import Sensed, without_normals
 from runners.sensors.session_report import Counts
 
 _MOST_OUTSIDE = 0.99  # of its points: more are no object's
 FARTHEST = 100.0  # m: no robot that probes an object measures rays of this length
 
 
-class Clouds:
-    """The points of one topic."""
+class Cloud:
+    """A sensor that sends points: the ends of free rays, the object's surface, or contacts."""
 
-    reads: ClassVar[type] = CloudMessage
+    _cell: RobotCell
+    _lattice: Lattice
 
-    def __init__(self, rig: CloudRig, cell: RobotCell, resolution: float) -> None:
-        """resolution: metres; of surface points one a voxel of this side is kept."""
-        self._rig, self._cell = rig, cell
-        self._lattice = Lattice(cell.free.workspace.lower, resolution)
+    def __init__(self, rig: CloudRig, resolution: float) -> None:
+        """Make the sensor; of surface points one a voxel of side `resolution`, metres, is kept."""
+        self.name = rig.topic
+        self.topics = (SensorTopic(rig.topic, CloudMessage, "points"),)
+        self.frame = None
+        self._rig = rig
+        self._resolution = resolution
+        self._touches = rig.role == "contacts"
         self._seen: set[tuple[int, int, int]] = set()
         self._new: list[FloatArray] = []
-        self._place: FloatArray | None = None
+        self._middle: FloatArray | None = None  # (3,), of the first message's points, world
         self._reaches = rig.role != "rays"  # whether its rays reach the workspace
 
-    @property
-    def touches(self) -> bool:
-        """Whether its points are contacts."""
-        return self._rig.role == "contacts"
+    def prepare(self, first_pass: FirstPass, cell: RobotCell) -> None:
+        """Keep the cell."""
+        self._cell = cell
+        self._lattice = Lattice(cell.free.workspace.lower, self._resolution)
 
     def take(self, time: int, message: CloudMessage, counts: Counts, *, within: bool) -> None:
         """Use the points of one message of the current probe."""
         counts.images += 1
-        if self.touches and not within:
+        if self._touches and not within:
             counts.spared += 1
             return
         pose = self._cell.world_from(message.frame, time, self._rig.topic)
@@ -53,8 +58,8 @@ class Clouds:
         counts.invalid += len(message.points) - len(points)
         counts.used += 1
         points, origin, free = apply(pose, points), pose[:3, 3], self._cell.free
-        if self._place is None and len(points):
-            self._place = np.median(points, axis=0)
+        if self._middle is None and len(points):
+            self._middle = np.median(points, axis=0)
         if self._rig.role == "rays":
             reached = ((points - origin) ** 2).sum(axis=1) <= FARTHEST**2
             ends = origin + self._rig.fraction * (points[reached] - origin)
@@ -65,15 +70,21 @@ class Clouds:
             self._new.append(self._unseen(points[reached], counts))
         counts.outside += int((~reached).sum())
 
+    def finish(self, step: int, counts: Counts) -> Sensed:
+        """Return the points on the object that came in a probe."""
+        points = without_normals(np.concatenate([np.zeros((0, 3)), *self._new]))
+        self._new = []
+        return Sensed(contacts=points) if self._touches else Sensed(surface=points)
+
     def remark(self, total: Counts) -> str:
-        """What is suspicious about all that it gave; "" if nothing is."""
+        """Return what is suspicious about all that it gave; "" if nothing is."""
         measured = total.pixels - total.invalid
         if total.used and not measured:
             return f"its {total.used} messages have no point that is finite"
-        if self._place is None:
+        if self._middle is None:
             return ""
-        place = ", ".join(f"{value:.4g}" for value in self._place)
-        where = f"in the first message around [{place}] m in the world"
+        middle = ", ".join(f"{value:.4g}" for value in self._middle)
+        where = f"in the first message around [{middle}] m in the world"
         if total.outside > _MOST_OUTSIDE * measured:
             reach = "out of the workspace"
             if self._rig.role == "rays":
@@ -86,13 +97,8 @@ class Clouds:
             return ""
         return f"{text}; check its unit and frame, and the workspace"
 
-    def surface(self) -> FloatArray:
-        """Points (N, 3) on the surface that came since the last call."""
-        new, self._new = self._new, []
-        return np.concatenate([np.zeros((0, 3)), *new])
-
     def _unseen(self, points: FloatArray, counts: Counts) -> FloatArray:
-        """The first point of every voxel that had none, of those that are the object's."""
+        """Return the first point of every voxel that had none, of those that are the object's."""
         _, first = np.unique(self._lattice.voxels(points), axis=0, return_index=True)
         points = points[np.sort(first)]
         gate = self._cell.gate

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
+from chsel.errors import SessionError
 from chsel.events import SensorImage
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.poses import apply
@@ -19,15 +20,20 @@ from chsel.sensing.depth_camera import (
 )
 from chsel.sensing.free_space import FreeGrid
 from runners.sensors.cell import RobotCell, is_entered
-from runners.sensors.log.messages import ImageMessage
+from runners.sensors.first_pass import FirstPass, SensorTopic
+from runners.sensors.log.messages import CameraInfoMessage, ImageMessage
 from runners.sensors.rig import CameraRig, GateRig, ImageRig
+from runners.sensors.sensor import Sensed
 from runners.sensors.session_report import Counts
 
 INTEGER_UNIT = 0.001  # m: of 16-bit depth images, as all the world has it
 FINE, COARSE = 0.0001, 0.001  # m: units of recorded images
 _MANY_PIXELS = 50_000  # of an image: more are looked at in part
 _EARLY = 0.95  # of the interval between two images: stamps are not exact
-
+_LEAST_WITHIN = 0.01  # of the numbers, or else these are no depths in metres
+_SHIFTED = 0.5  # pixels by which intrinsics differ
+RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
+"""Pattern of the names of topics of rectified images, by the convention of ROS."""
 
 MISSED = (
     "its rays miss the workspace; check its frame, which must be the optical one (x right, z "
@@ -53,7 +59,7 @@ def view_of(
     cell: RobotCell,
     counts: Counts,
 ) -> View | None:
-    """An image at a time, nanoseconds, and its pose; None, counted, where it cannot be used."""
+    """Return an image at a time, nanoseconds, with its pose; None, counted, if it is unusable."""
     shape = (camera.height, camera.width)
     if message.values.shape != shape:
         cell.warnings.warn(
@@ -73,14 +79,14 @@ def view_of(
 
 
 def metres(values: np.ndarray, unit: float | None) -> FloatArray:
-    """An image (H, W) in metres; unit: metres, by default INTEGER_UNIT for integers, else 1."""
+    """Return an image (H, W) in metres; unit: by default INTEGER_UNIT of integers, else 1."""
     if unit is None:
         unit = INTEGER_UNIT if np.issubdtype(values.dtype, np.integer) else 1.0
     return values.astype(np.float64) * unit
 
 
 def recorded_image(step: int, sensor: str, kind: str, view: View, mask: BoolArray) -> SensorImage:
-    """An image with a mask (H, W) as recordings have it, 0 where it is not valid."""
+    """Return an image with a mask (H, W) as recordings have it, 0 where it is not valid."""
     kept, camera = np.where(view.valid, view.metres, 0.0), view.camera
     unit = FINE if kept.max(initial=0.0) < 65535 * FINE else COARSE
     values = np.clip(np.rint(kept / unit), 0, 65535).astype(np.uint16)
@@ -89,7 +95,7 @@ def recorded_image(step: int, sensor: str, kind: str, view: View, mask: BoolArra
 
 
 def edge_pixels(rig: CameraRig, view: View) -> BoolArray:
-    """Valid pixels (H, W) beside a jump of depth; none, if the rig asks for all."""
+    """Return valid pixels (H, W) beside a jump of depth; none, if the rig asks for all."""
     if rig.edge is None:
         return np.zeros_like(view.valid)
     return occlusion_edges(view.metres, view.valid, rig.edge, reach=rig.edge_reach)
@@ -100,7 +106,7 @@ def mark_rays(
 ) -> tuple[int, int]:
     """Mark what the rays of usable pixels (H, W) pass.
 
-    The rays of speckles end at the least depth of the valid pixels around them. Returns how many
+    The rays of speckles end at the least depth of the valid pixels around them. Return how many
     voxels became free, and how many pixels are of speckles.
     """
     regions = depth_regions(view.metres, usable, view.camera, gate.jump)
@@ -110,24 +116,109 @@ def mark_rays(
 
 
 def some_rays(rig: CameraRig, view: View, usable: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Origin (3,) and ends (N, 3), world, of the rays of some of the usable pixels (H, W)."""
+    """Return origin (3,) and ends (N, 3), world, of rays of some of the usable pixels (H, W)."""
     pose, some = view.world_from_camera, slice(None, None, 1 + usable.size // _MANY_PIXELS)
     ends = rig.fraction * view.camera.back_project(view.metres)[some, some]
     return pose[:3, 3], apply(pose, ends[usable[some, some]])
 
 
+def image_topics(rig: ImageRig) -> tuple[SensorTopic, SensorTopic]:
+    """Return the topics of a sensor that sends depth images: images and intrinsics."""
+    return (
+        SensorTopic(rig.depth, ImageMessage, f"depth of {rig.name}"),
+        SensorTopic(rig.info, CameraInfoMessage, f"camera info of {rig.name}"),
+    )
+
+
+def first_images(rig: ImageRig, first_pass: FirstPass) -> list[tuple[int, np.ndarray]]:
+    """Return the first images (H, W) of a sensor, with their times, nanoseconds."""
+    images = []
+    for received in first_pass.first(image_topics(rig)[0]):
+        assert isinstance(received.content, ImageMessage)
+        images.append((first_pass.clocks.time(received), received.content.values))
+    return images
+
+
+def camera_of(rig: ImageRig, first_pass: FirstPass) -> PinholeCamera:
+    """Return the intrinsics of a sensor. Raise SessionError unless they fit its images."""
+    of_info = image_topics(rig)[1]
+    infos = first_pass.first(of_info)
+    if not infos:
+        raise first_pass.error(f"no camera info of {rig.name} on {rig.info}", of_info)
+    info = infos[0].content
+    assert isinstance(info, CameraInfoMessage)
+    height, width = first_images(rig, first_pass)[0][1].shape
+    rectified = rig.rectified
+    if rectified is None:
+        rectified = RECTIFIED.search(rig.depth) is not None
+    camera = info.rectified if rectified and info.rectified is not None else info.camera
+    if (info.camera.height, info.camera.width) != (height, width):
+        raise first_pass.error(
+            f"images of {rig.name} have {width} x {height} pixels, and its camera info says "
+            f"{info.camera.width} x {info.camera.height}; accepted: the same"
+        )
+    if info.distorted and not rectified:
+        first_pass.warnings.warn(
+            f"{rig.name}: its camera info names a distortion, which is not undone"
+        )
+    if rig.rectified is None and not rectified and _differ(info):
+        first_pass.warnings.warn(
+            f"{rig.name}: K and P of its camera info differ, and topic {rig.depth} does not say "
+            "that its images are rectified: K is used; with rectified: true in the rig, P is"
+        )
+    for warning in camera.check_centre():
+        first_pass.warnings.warn(f"{rig.name}: {warning.text}")
+    return camera
+
+
+def _differ(info: CameraInfoMessage) -> bool:
+    """Return whether rectified images have other intrinsics, by more than half a pixel."""
+    one, other = info.camera, info.rectified
+    if other is None:
+        return False
+    away = np.subtract([one.fx, one.fy, one.cx, one.cy], [other.fx, other.fy, other.cx, other.cy])
+    return bool((np.abs(away) > _SHIFTED).any())
+
+
+def check_unit(rig: ImageRig, first_pass: FirstPass) -> None:
+    """Raise SessionError if the first images have depths, and next to none is within range."""
+    images = [values for _, values in first_images(rig, first_pass)]
+    depths = np.concatenate([metres(values, rig.unit).reshape(-1) for values in images])
+    depths = depths[np.isfinite(depths) & (depths > 0.0)]
+    nearest, furthest = rig.range
+    within = valid_pixels(depths, nearest=nearest, furthest=furthest)
+    if len(depths) and within.mean() < _LEAST_WITHIN:
+        unit = metres(np.ones(1, images[0].dtype), rig.unit)[0]
+        raise SessionError(
+            f"topic {rig.depth} of {rig.name} has depths of {np.median(depths):.4g} m (median, at "
+            f"{unit:g} m a unit); accepted: from {nearest:g} to {furthest:g} m, its range: set "
+            "unit, the metres of a unit of its images, or range"
+        )
+
+
 class DepthCamera:
-    """Marks what it sees through (CHSEL, Sec. V-B: rays to 95 % of the depth)."""
+    """A sensor that marks as free what it sees through (CHSEL, Sec. V-B: 95 % of the depth)."""
 
-    reads: ClassVar[type] = ImageMessage
+    _camera: PinholeCamera
+    _cell: RobotCell
 
-    def __init__(self, rig: CameraRig, camera: PinholeCamera, cell: RobotCell) -> None:
-        self._rig, self._camera, self._cell = rig, camera, cell
-        several, workspace = rig.views > 1, cell.free.workspace
-        self._own = FreeGrid(workspace, cell.spacing, views=rig.views) if several else None
+    def __init__(self, rig: CameraRig) -> None:
+        self.name = rig.name
+        self.topics = image_topics(rig)
+        self.frame = rig.frame
+        self._rig = rig
+        self._own: FreeGrid | None = None  # where several views make a voxel free
         self._last_time: int | None = None
         self._reaches = False  # whether its rays reach the workspace
         self._last: tuple[View, BoolArray] | None = None
+
+    def prepare(self, first_pass: FirstPass, cell: RobotCell) -> None:
+        """Take the intrinsics. Raise SessionError unless they and depths fit the rig."""
+        self._cell = cell
+        self._camera = camera_of(self._rig, first_pass)
+        check_unit(self._rig, first_pass)
+        if self._rig.views > 1:
+            self._own = FreeGrid(cell.free.workspace, cell.spacing, views=self._rig.views)
 
     def take(self, time: int, message: ImageMessage, counts: Counts, *, within: bool) -> None:
         """Use an image of the current probe, unless it comes too soon after the last one."""
@@ -155,18 +246,19 @@ class DepthCamera:
             self._reaches = is_entered(self._cell.free.workspace, *rays)
         self._last_time, self._last = time, (view, usable)
 
+    def finish(self, step: int, counts: Counts) -> Sensed:
+        """Return the last image of a probe, with the pixels whose rays are free."""
+        if self._last is None:
+            return Sensed()
+        view, usable = self._last
+        self._last = None
+        return Sensed(image=recorded_image(step, self.name, "depth", view, usable))
+
     def remark(self, total: Counts) -> str:
-        """What is suspicious about all that it gave; "" if nothing is."""
+        """Return what is suspicious about all that it gave; "" if nothing is."""
         if self._reaches or not total.used:
             return ""
         return f"{MISSED} (all of {total.used} images)"
-
-    def image(self, step: int) -> SensorImage | None:
-        """The last image since the last call, with the pixels whose rays are free."""
-        if self._last is None:
-            return None
-        (view, usable), self._last = self._last, None
-        return recorded_image(step, self._rig.name, "depth", view, usable)
 
     def _too_soon(self, time: int) -> bool:
         if self._rig.rate is None or self._last_time is None:

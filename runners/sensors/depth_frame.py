@@ -83,9 +83,9 @@ class DepthFrame:
 
 
 def read_depth_frame(path: str | Path) -> DepthFrame:
-    """The frame that a YAML describes with the keys of `FrameFile`.
+    """Return the frame that a YAML describes with the keys of `FrameFile`.
 
-    Raises SessionError, which names the file and the key.
+    Raise SessionError, which names the file and the key.
     """
     path = Path(path).expanduser()
     try:
@@ -109,7 +109,7 @@ def _frame(file: FrameFile, folder: Path) -> DepthFrame:
 
 
 def _depth(file: FrameFile, folder: Path) -> FloatArray:
-    """Metres (H, W)."""
+    """Return depths (H, W), metres."""
     path = folder / Path(file.depth).expanduser()
     stored = read_image(path, "depth")
     if stored.dtype == np.uint8:
@@ -122,7 +122,7 @@ def _depth(file: FrameFile, folder: Path) -> FloatArray:
 
 
 def _label(file: FrameFile, folder: Path, shape: tuple[int, ...]) -> BoolArray:
-    """The object's pixels (H, W)."""
+    """Return the object's pixels (H, W)."""
     path = folder / Path(file.label or "").expanduser()
     classes = read_image(path, "label")
     if classes.dtype.kind not in "ui" or classes.shape != shape:
@@ -140,7 +140,7 @@ def _label(file: FrameFile, folder: Path, shape: tuple[int, ...]) -> BoolArray:
 
 @dataclass(frozen=True, eq=False)
 class FramePoints:
-    """What follows from a frame, and how many of its pixels do not count."""
+    """Known points of a frame, and counts of its pixels that do not count."""
 
     points: KnownPoints  # free voxels' centres, and surface points; metres, world
     workspace: Workspace  # where the object can be
@@ -153,10 +153,10 @@ class FramePoints:
 def depth_frame_points(
     frame: DepthFrame, rig: Rig, *, free_resolution: float, diameter: float | None = None
 ) -> FramePoints:
-    """The known points of a frame, by the thresholds of the rig's only camera.
+    """Return the known points of a frame, by the thresholds of the rig's only camera.
 
     free_resolution: metres. diameter: of the object, metres; without a workspace in the rig, it is
-    the bounds of the surface points, padded by this. Raises SettingError for a rig that does not
+    the bounds of the surface points, padded by this. Raise SettingError for a rig that does not
     fit, SessionError for a frame without a usable pixel.
     """
     if len(rig.cameras) != 1:
@@ -202,7 +202,7 @@ def _surface_pixels(
     measured: FloatArray,
     diameter: float | None,
 ) -> tuple[BoolArray, Counts]:
-    """The object's pixels (H, W) but for those at its outline, where others are mixed in.
+    """Return the object's pixels (H, W) but for those at its outline, where others are mixed in.
 
     Of these, those in regions that can be the object's; the others are counted by reason.
     """

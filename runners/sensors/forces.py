@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -13,10 +12,12 @@ from chsel.problem.points import Lattice
 from chsel.problem.poses import apply, inverse, rotated
 from chsel.sensing.contact_sensing import contact_ahead, contact_on_axis
 from runners.sensors.cell import RobotCell
+from runners.sensors.first_pass import FirstPass, SensorTopic
 from runners.sensors.hand import HandModel
 from runners.sensors.log.messages import WrenchMessage
 from runners.sensors.log.transforms import JointHistory
 from runners.sensors.rig import ForceRig
+from runners.sensors.sensor import Sensed
 from runners.sensors.session_report import Counts
 
 _MOST_LOOKED_AT = 50  # samples of a probe, the strongest
@@ -34,33 +35,34 @@ class _Sample:
     numbers: tuple[float, ...]  # force, N; torque, Nm
 
 
-class Forces:
-    """The forces of one topic; of each probe, where the strongest act."""
+class ForceSensor:
+    """A sensor of forces on the hand; of each probe, it gives where the strongest act."""
 
-    reads: ClassVar[type] = WrenchMessage
+    _cell: RobotCell
+    _joints: JointHistory
+    _lattice: Lattice
 
-    def __init__(
-        self,
-        rig: ForceRig,
-        frame: str,
-        model: HandModel,
-        joints: JointHistory,
-        cell: RobotCell,
-        resolution: float,
-    ) -> None:
-        """frame, model, joints: of the hand.
-
-        resolution: metres; of the contacts of a probe one a voxel of this side is kept.
-        """
-        self._rig, self._cell = rig, cell
-        self._frame, self._model, self._joints = frame, model, joints
-        self._lattice = Lattice(cell.free.workspace.lower, resolution)
+    def __init__(self, rig: ForceRig, resolution: float, hand: HandModel | None) -> None:
+        """Make the sensor of a hand; one contact a voxel of side `resolution`, metres, is kept."""
+        assert hand is not None  # a rig with forces has one
+        self.name = rig.topic
+        self.topics = (SensorTopic(rig.topic, WrenchMessage, "forces"),)
+        self.frame = rig.frame
+        self._rig = rig
+        self._resolution = resolution
+        self._hand = hand
         self._idle: deque[tuple[int, FloatArray]] = deque(maxlen=_MOST_TARED)
         self._tare: FloatArray | None = None
         self._within = self._has_torque = self._in_contact = False
         self._largest = 0.0  # newtons
         self._row: list[_Sample] = []  # not yet long enough for a contact
-        self._felt: list[_Sample] = []
+        self._strong: list[_Sample] = []
+
+    def prepare(self, first_pass: FirstPass, cell: RobotCell) -> None:
+        """Keep the cell, and the joints that move the hand."""
+        self._cell = cell
+        self._joints = first_pass.joints
+        self._lattice = Lattice(cell.free.workspace.lower, self._resolution)
 
     def take(self, time: int, message: WrenchMessage, counts: Counts, *, within: bool) -> None:
         """Use a message; `within` a probe's begin and end, forces are of contacts."""
@@ -88,8 +90,24 @@ class Forces:
             )
             self._set_tare(time)
 
+    def finish(self, step: int, counts: Counts) -> Sensed:
+        """Return the contacts of a probe, the strongest first."""
+        self._end_row(counts)
+        samples = sorted(self._strong, reverse=True)[:_MOST_LOOKED_AT]
+        self._strong = []
+        found: dict[tuple[int, ...], FloatArray] = {}
+        for sample in samples:
+            contact = self._contact(sample, counts)
+            if contact is not None:
+                voxel = tuple(self._lattice.voxels(contact[None, :3])[0].tolist())
+                found.setdefault(voxel, contact)
+            if len(found) == self._rig.points:
+                break
+        contacts = np.reshape(list(found.values()), (-1, 6))
+        return Sensed(contacts=contacts, rigid=True)
+
     def remark(self, total: Counts) -> str:
-        """What is suspicious about all that it gave; "" if nothing is."""
+        """Return what is suspicious about all that it gave; "" if nothing is."""
         if not total.used or total.contacts:
             return ""
         if total.outside:
@@ -102,23 +120,8 @@ class Forces:
             f"the threshold {self._rig.threshold:g} N for {self._rig.samples} in a row"
         )
 
-    def contacts(self, counts: Counts) -> FloatArray:
-        """The contacts (C, 6) since the last call, the strongest first: points and normals."""
-        self._end_row(counts)
-        samples, self._felt = sorted(self._felt, reverse=True)[:_MOST_LOOKED_AT], []
-        found: dict[tuple[int, ...], FloatArray] = {}
-        for sample in samples:
-            contact = self._contact(sample, counts)
-            if contact is not None:
-                voxel = tuple(self._lattice.voxels(contact[None, :3])[0].tolist())
-                found.setdefault(voxel, contact)
-            if len(found) == self._rig.points:
-                break
-        counts.contacts += len(found)
-        return np.reshape(list(found.values()), (-1, 6))
-
     def _set_tare(self, time: int) -> None:
-        """The median of what came last; without any, the tare stays what it was."""
+        """Take the median of what came last as the tare; without any, keep the tare."""
         since = time - self._rig.tare * _NANOSECONDS
         idle = [numbers for moment, numbers in self._idle if moment >= since]
         self._idle.clear()
@@ -133,20 +136,20 @@ class Forces:
         self._row.append(sample)
         if self._in_contact or len(self._row) >= self._rig.samples:
             self._in_contact = True
-            self._felt += self._row
+            self._strong += self._row
             self._row.clear()
 
     def _end_row(self, counts: Counts) -> None:
-        """The force is no longer above the threshold, or its probe is over."""
+        """End a row of samples, as the force is below the threshold or the probe is over."""
         counts.spikes += len(self._row)
         self._row.clear()
         self._in_contact = False
 
     def _contact(self, sample: _Sample, counts: Counts) -> FloatArray | None:
-        """Where a force acts, and the object's outward normal (6,), world; None, counted."""
+        """Return where a force acts, and the outward normal (6,), world; None, counted."""
         sensor = self._rig.frame or sample.frame
         world_from_sensor = self._cell.world_from(sensor, sample.time, self._rig.topic)
-        world_from_hand = self._cell.world_from(self._frame, sample.time, self._rig.topic)
+        world_from_hand = self._cell.world_from(self._hand.frame, sample.time, self._rig.topic)
         if world_from_sensor is None or world_from_hand is None:
             counts.lost += 1
             return None
@@ -157,7 +160,7 @@ class Forces:
             )
             counts.lost += 1
             return None
-        solids = self._model.solids(joints)
+        solids = self._hand.solids(joints)
         assert solids is not None  # a rig with forces has some
         corners = np.asarray(solids.triangles, dtype=np.float64).reshape(-1, 3)
         sensor_from_hand = inverse(world_from_sensor) @ world_from_hand

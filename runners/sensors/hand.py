@@ -25,30 +25,41 @@ from runners.sensors.session_report import Counts
 if TYPE_CHECKING:
     import trimesh
 
+HAND = "hand"
+"""Name under which the hand is counted."""
 MOST_POSES = 200  # of a probe's path, as it is shown
 _BATCH = 50_000  # poses looked up at once
 _MOVING = ("revolute", "continuous", "prismatic")
 
 
 class HandModel:
-    """The solids of a hand, read once, placed as often as joints move.
+    """The solids of a hand, read once, placed as often as joints move."""
 
-    joint_names: joints whose values move any of them. sliding: those of them that are prismatic.
-    warnings: what a user should know of how they were read. Raises SettingError for a URDF that
-    cannot be used.
-    """
+    frame: str
+    """Frame of the hand in the log."""
+
+    joint_names: tuple[str, ...]
+    """Joints whose values move any of the solids."""
+
+    sliding: frozenset[str]
+    """Names of the joints that are prismatic."""
+
+    warnings: list[str]
+    """Warnings of how the solids were read."""
 
     def __init__(self, rig: HandRig) -> None:
-        self.joint_names: tuple[str, ...] = ()
-        self.sliding: frozenset[str] = frozenset()
-        self.warnings: list[str] = []
+        """Read the solids. Raise SettingError for a URDF that cannot be used."""
+        self.frame = rig.frame
+        self.joint_names = ()
+        self.sliding = frozenset()
+        self.warnings = []
         self._boxes = [box_mesh(box) for box in rig.boxes]
         self._links: list[tuple[str, trimesh.Trimesh]] = []  # nodes of the scene, with their solids
         if rig.urdf is not None:
             self._read_urdf(Path(rig.urdf), rig.root)
 
     def parts(self, joints: Mapping[str, float] | None = None) -> list[trimesh.Trimesh]:
-        """Closed solids in the hand's frame, metres; they may overlap.
+        """Return closed solids in the hand's frame, metres; they may overlap.
 
         joints: values by name, radians or metres. Those of other joints do not matter, missing
         ones are 0.
@@ -64,7 +75,7 @@ class HandModel:
         ]
 
     def solids(self, joints: Mapping[str, float] | None = None) -> trimesh.Trimesh | None:
-        """All parts as one mesh of several closed bodies; None if the rig describes none."""
+        """Return all parts as one mesh of closed bodies; None if the rig describes none."""
         import trimesh
 
         parts = self.parts(joints)
@@ -72,7 +83,7 @@ class HandModel:
         return joined
 
     def _read_urdf(self, path: Path, root: str | None) -> None:
-        """The links at and below `root`, which move with it; their kinematics are yourdfpy's."""
+        """Read the links at and below `root`, which move with it, by yourdfpy."""
         where = f"hand.urdf {path}"
         self._robot = robot = _robot(path.expanduser(), where)
         scene = robot.collision_scene
@@ -97,7 +108,7 @@ class HandModel:
             )
 
     def _solid(self, mesh: Any, name: str) -> trimesh.Trimesh:
-        """A closed solid, turned outward: a mesh, or its convex hull if it is open."""
+        """Return a closed solid, turned outward: a mesh, or its convex hull if it is open."""
         import trimesh
 
         if mesh.units not in (None, "meters"):
@@ -113,7 +124,7 @@ class HandModel:
 
 
 def box_mesh(box: BoxRig) -> trimesh.Trimesh:
-    """A closed box in the frame of its position, metres."""
+    """Return a closed box in the frame of its position, metres."""
     import trimesh
 
     hand_from_box = compose(roll_pitch_yaw(np.array(box.rotation)), np.array(box.position))
@@ -121,7 +132,7 @@ def box_mesh(box: BoxRig) -> trimesh.Trimesh:
 
 
 def _robot(path: Path, where: str) -> Any:
-    """The model of a URDF, with the meshes of its collision shapes."""
+    """Return the model of a URDF, with the meshes of its collision shapes."""
     if not path.is_file():
         raise SettingError(f"{where} does not exist; accepted: a URDF file")
     try:
@@ -165,7 +176,7 @@ def _robot(path: Path, where: str) -> Any:
 
 
 def _mesh_file(fname: str, folder: Path) -> str:
-    """The path of a mesh; a package is one of the folders above the URDF, or in one."""
+    """Return the path of a mesh; a package is one of the folders above the URDF, or in one."""
     name = fname.rpartition("://")[2]
     for parent in (folder, *folder.parents):
         for path in (parent / name, parent / name.partition("/")[2]):
@@ -176,12 +187,12 @@ def _mesh_file(fname: str, folder: Path) -> str:
 
 
 class HandPath:
-    """Where the hand was, probe by probe, and the free space that follows."""
+    """The path of the hand, probe by probe, and the free space that follows."""
 
     def __init__(
         self, rig: HandRig, model: HandModel, joints: JointHistory, times: IntArray, cell: RobotCell
     ) -> None:
-        """times (T,): of all transforms, nanoseconds, ascending."""
+        """Make the path of a hand; times (T,): of all transforms, nanoseconds, ascending."""
         self._frame, self._model, self._joints, self._times = rig.frame, model, joints, times
         self._cell = cell
         self._reaches = False  # whether its solids reach the workspace
@@ -212,7 +223,7 @@ class HandPath:
         return path[np.linspace(0, len(path) - 1, count).astype(int)]
 
     def remark(self, total: Counts) -> str:
-        """What is suspicious about all that it gave; "" if nothing is."""
+        """Return what is suspicious about all that the hand gave; "" if nothing is."""
         if self._reaches or not total.used or self._model.solids() is None:
             return ""
         return (
@@ -221,12 +232,12 @@ class HandPath:
         )
 
     def _is_near(self, places: FloatArray, reach: float) -> bool:
-        """Whether any of places (P, 3) is less than `reach` metres beside the workspace."""
+        """Return whether one of points (P, 3) is less than `reach` metres beside the workspace."""
         lower, upper = self._cell.free.workspace.bounds
         return bool(((places > lower - reach) & (places < upper + reach)).all(axis=1).any())
 
     def _runs(self, begin: int, end: int, counts: Counts) -> Iterator[FloatArray]:
-        """Poses (P, 4, 4) from a time to before another, cut where they are not known for long."""
+        """Yield poses (P, 4, 4) from a time to before another, cut at gaps and jumps."""
         times = self._times[slice(*np.searchsorted(self._times, (begin, end)))]
         cell = self._cell
         jumps = cell.tree.jumps(cell.world, self._frame) if len(times) else times
@@ -243,7 +254,7 @@ class HandPath:
             yield from (run for run in np.split(poses[known], cuts) if len(run))
 
     def _interior(self, joints: dict[str, float]) -> FloatArray:
-        """Points (M, 3) in the hand, dense enough to miss no voxel."""
+        """Return points (M, 3) in the hand, dense enough to miss no voxel."""
         before, self._filled = self._filled, {}
         side = 0.5 * self._cell.spacing
         for part in self._model.parts(joints):

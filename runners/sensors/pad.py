@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import sqrt
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -22,10 +21,21 @@ from chsel.sensing.depth_camera import (
     valid_pixels,
 )
 from runners.sensors.cell import RobotCell
-from runners.sensors.depth_camera import View, metres, recorded_image, view_of
+from runners.sensors.depth_camera import (
+    View,
+    camera_of,
+    check_unit,
+    first_images,
+    image_topics,
+    metres,
+    recorded_image,
+    view_of,
+)
+from runners.sensors.first_pass import FirstPass
 from runners.sensors.log.images import read_image
 from runners.sensors.log.messages import ImageMessage
 from runners.sensors.rig import BubbleRig, ContactRig
+from runners.sensors.sensor import Sensed
 from runners.sensors.session_report import Counts
 
 REACH = 0.1  # m: of the membrane from its camera, for how far a turn moves it
@@ -34,10 +44,10 @@ REACH = 0.1  # m: of the membrane from its camera, for how far a turn moves it
 def membrane_reference(
     rig: BubbleRig, samples: list[np.ndarray], camera: PinholeCamera, beside: Path
 ) -> FloatArray:
-    """Depth (H, W) of a pad's untouched membrane, metres, 0 where it is not known.
+    """Return depth (H, W) of a pad's untouched membrane, metres, 0 where it is not known.
 
     By the rig's file, relative to the folder `beside` unless it is found as it stands; or the
-    median of images (H, W). Raises SessionError if there are none, or of another size.
+    median of images (H, W). Raise SessionError if there are none, or of another size.
     """
     images = samples if rig.kind == "depth" else []
     if rig.reference is not None:
@@ -70,47 +80,60 @@ def membrane_reference(
 
 @dataclass(frozen=True, eq=False)
 class Imprint:
-    """One image of a membrane, in contact or not.
+    """One image of a membrane, in contact or not."""
 
-    view: depth of the membrane as it is. pressed (H, W): smoothed deformation, metres. touching
-    (H, W): pixels in contact.
-    """
-
-    view: View
-    pressed: FloatArray
-    touching: BoolArray
+    view: View  # depth of the membrane as it is
+    pressed: FloatArray  # (H, W), smoothed deformation, metres
+    touching: BoolArray  # (H, W), pixels in contact
 
     @property
     def size(self) -> int:
-        """How many pixels are in contact."""
+        """Number of pixels in contact."""
         return int(self.touching.sum())
 
     def outweighs(self, other: Imprint | None) -> bool:
-        """Whether more pixels are in contact, or without any contact, the membrane gives more."""
+        """Return whether more pixels are in contact, or without any, the membrane gives more."""
         if other is None or self.size != other.size:
             return other is None or self.size > other.size
         return self.size == 0 and bool(self.pressed.max() > other.pressed.max())
 
 
 class Pad:
-    """One pad; its contact is that of the image with the most pixels in contact (Sec. V-B)."""
+    """A sensor whose contact is that of the image with the most pixels in contact (Sec. V-B)."""
 
-    reads: ClassVar[type] = ImageMessage
+    _camera: PinholeCamera
+    _cell: RobotCell
+    _reference: FloatArray  # (H, W), depth of the untouched membrane, metres, 0 where not known
+    _lengths: FloatArray  # (H, W), of the rays to depth 1
 
-    def __init__(
-        self,
-        rig: BubbleRig,
-        contact: ContactRig,
-        camera: PinholeCamera,
-        reference: FloatArray,
-        cell: RobotCell,
-    ) -> None:
-        """reference (H, W): depth of the untouched membrane, metres, 0 where it is not known."""
-        self._rig, self._contact, self._cell = rig, contact, cell
-        self._camera, self._reference = camera, reference
-        self._lengths = np.sqrt((camera.directions() ** 2).sum(axis=-1))
+    def __init__(self, rig: BubbleRig, contact: ContactRig) -> None:
+        self.name = rig.name
+        self.topics = image_topics(rig)
+        self.frame = rig.frame
+        self._rig = rig
+        self._contact = contact
         self._last_pose: FloatArray | None = None
         self._best: Imprint | None = None
+
+    def prepare(self, first_pass: FirstPass, cell: RobotCell) -> None:
+        """Take the intrinsics and the untouched membrane. Raise SessionError without them."""
+        self._cell = cell
+        self._camera = camera_of(self._rig, first_pass)
+        if self._rig.kind == "depth":
+            check_unit(self._rig, first_pass)
+        self._lengths = np.sqrt((self._camera.directions() ** 2).sum(axis=-1))
+        images = first_images(self._rig, first_pass)
+        begin = first_pass.windows[0].begin
+        untouched = [values for time, values in images if time < begin]
+        if self._rig.reference is None and self._rig.kind == "depth" and not untouched:
+            untouched = [values for _, values in images]
+            first_pass.warnings.warn(
+                f"{self.name}: no image before the first probe; its reference is made of the first "
+                f"{len(untouched)} of the probe"
+            )
+        self._reference = membrane_reference(
+            self._rig, untouched, camera=self._camera, beside=first_pass.folder
+        )
 
     def take(self, time: int, message: ImageMessage, counts: Counts, *, within: bool) -> None:
         """Use an image of the current probe; `within` its begin and end, contacts count."""
@@ -127,7 +150,7 @@ class Pad:
         counts.spared += not (within or moved)
 
     def remark(self, total: Counts) -> str:
-        """What is suspicious about all that it gave; "" if nothing is."""
+        """Return what is suspicious about all that it gave; "" if nothing is."""
         if not total.used or total.free or total.contacts:
             return ""
         return (
@@ -136,26 +159,28 @@ class Pad:
             "workspace"
         )
 
-    def strongest(self, counts: Counts) -> Imprint | None:
-        """The image of the contact since the last call."""
-        best, self._best = self._best, None
-        if best is not None:
-            counts.touching += best.size
-            self._mark(best.view, counts)
-        return best
+    def finish(self, step: int, counts: Counts) -> Sensed:
+        """Return the contact pixels of a probe, and the deformation as an image."""
+        best = self._best
+        self._best = None
+        if best is None:
+            return Sensed()
+        counts.touching += best.size
+        self._mark(best.view, counts)
+        return Sensed(candidates=self._contacts(best), image=self._image(step, best))
 
-    def image(self, step: int, imprint: Imprint) -> SensorImage:
-        """The deformation with the pixels in contact."""
+    def _image(self, step: int, imprint: Imprint) -> SensorImage:
+        """Return the deformation with the pixels in contact."""
         valid = imprint.view.valid & (imprint.pressed > 0.0)
         pressed = View(imprint.pressed, valid, self._camera, imprint.view.world_from_camera)
-        return recorded_image(step, self._rig.name, "deformation", pressed, imprint.touching)
+        return recorded_image(step, self.name, "deformation", pressed, imprint.touching)
 
-    def contacts(self, imprint: Imprint, chosen: np.ndarray) -> FloatArray:
-        """Points and outward normals of the object (C, 6), of chosen (C,) contact pixels."""
-        view, touching = imprint.view, imprint.touching
-        points = self._camera.back_project(view.metres)[touching][chosen]
+    def _contacts(self, imprint: Imprint) -> FloatArray:
+        """Return points and outward normals of the object (C, 6) at the contact pixels, world."""
+        view = imprint.view
+        points = self._camera.back_project(view.metres)[imprint.touching]
         filled = np.where(view.valid, view.metres, self._reference)
-        normals = self._normals(smooth(filled, self._contact.filter))[touching][chosen]
+        normals = self._normals(smooth(filled, self._contact.filter))[imprint.touching]
         pose = view.world_from_camera
         return np.concatenate([apply(pose, points), rotated(pose[:3, :3], normals)], axis=1)
 
@@ -191,7 +216,7 @@ class Pad:
     def _main(
         self, depth: FloatArray, usable: BoolArray, counts: Counts, *, least: int = 0
     ) -> BoolArray:
-        """Of pixels (H, W) those in regions without a jump of depth that are not too small.
+        """Return those of pixels (H, W) in regions without a jump of depth that are not too small.
 
         least: pixels of a region.
         """
@@ -203,7 +228,7 @@ class Pad:
         return kept
 
     def _mark(self, view: View, counts: Counts) -> None:
-        """The pad's inside is free, less half a voxel's diagonal before what it may touch."""
+        """Mark the pad's inside as free, less half a voxel's diagonal before what it may touch."""
         depth = view.metres - sqrt(0.75) * self._cell.spacing / self._lengths
         inside, pose = view.valid & (depth > 0.0), view.world_from_camera
         counts.free += self._cell.free.grid.from_depth(
@@ -211,7 +236,7 @@ class Pad:
         )
 
     def _has_moved(self, pose: FloatArray) -> bool:
-        """Whether the membrane is half a voxel away from where it was last marked."""
+        """Return whether the membrane is half a voxel away from where it was last marked."""
         if self._last_pose is not None:
             change = inverse(self._last_pose) @ pose
             distance = np.sqrt((change[:3, 3] ** 2).sum())
@@ -221,7 +246,7 @@ class Pad:
         return True
 
     def _normals(self, depth: FloatArray) -> FloatArray:
-        """Unit normals (H, W, 3) of a depth image's surface, towards the camera; 0 if unknown."""
+        """Return unit normals (H, W, 3) of a depth image, towards the camera; 0 if unknown."""
         points = self._camera.back_project(depth)
         normals = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
         away = (normals * points).sum(axis=-1, keepdims=True) > 0.0

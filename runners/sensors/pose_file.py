@@ -35,7 +35,7 @@ _Loader.add_implicit_resolver(
 
 
 def read_yaml(path: Path) -> dict[Any, Any]:
-    """The mapping in a file. Raises SessionError, whose text begins after the name of the file."""
+    """Return the mapping in a file. Raise SessionError, its text without the file's name."""
     refuse_special_file("it", path, SessionError)
     try:
         values = yaml.load(path.read_bytes(), _Loader)
@@ -49,13 +49,13 @@ def read_yaml(path: Path) -> dict[Any, Any]:
 
 
 def beside(path: str | Path) -> Path:
-    """Where the pose of a log or recording is looked for: X.pose.yaml beside X.mcap or folder X."""
+    """Return the place of a log's pose: X.pose.yaml beside X.mcap or folder X."""
     path = Path(path).absolute()
     return path.with_name(path.name.removesuffix(".mcap") + SUFFIX)
 
 
 def read_pose(path: str | Path) -> FloatArray:
-    """world_from_object (4, 4) of a file. Raises SessionError unless it holds a rigid one."""
+    """Return world_from_object (4, 4) of a file. Raise SessionError unless it is rigid."""
     path = Path(path).expanduser()
     try:
         return pose_of_rows(KEY, read_yaml(path).get(KEY))
@@ -64,7 +64,7 @@ def read_pose(path: str | Path) -> FloatArray:
 
 
 def pose_of_rows(name: str, rows: Any) -> FloatArray:
-    """A rigid transform (4, 4) of a file, its rotation made exact: people write a few digits."""
+    """Return a rigid transform (4, 4) of a file; its rotation, of few digits, is made exact."""
     pose = nearest_rigid(name, frozen(name, rows, (4, 4), error=SessionError)[None])[0]
     pose.setflags(write=False)
     return pose
@@ -75,7 +75,7 @@ def write_pose(
 ) -> None:
     """Write a pose (4, 4), and what a person may want to know about it, plain values.
 
-    Raises RecordingError if there is such a file already, unless it may be overwritten, and
+    Raise RecordingError if there is such a file already, unless it may be overwritten, and
     ChselError if it cannot be written.
     """
     values = {KEY: np.asarray(world_from_object, dtype=np.float64).tolist(), **about}

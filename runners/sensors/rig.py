@@ -13,7 +13,7 @@ from chsel.problem.settings import Check, CheckedSettings, not_negative, one_of,
 
 
 def _fits(accepted: str, is_accepted: Callable[[Any], bool]) -> Check:
-    """What a value must be, in words and as a condition; NaN fulfils none."""
+    """Return a check by a condition, which NaN does not fulfil, with what is accepted in words."""
 
     def check(name: str, value: Any) -> None:
         if not is_accepted(value):
@@ -23,7 +23,7 @@ def _fits(accepted: str, is_accepted: Callable[[Any], bool]) -> Check:
 
 
 def _points(name: str, value: Any) -> None:
-    """Finite points."""
+    """Raise SettingError unless a value is finite points (N, 3)."""
     frozen(name, value, (None, 3), error=SettingError)
 
 
@@ -41,7 +41,7 @@ Quantile = Annotated[float, _fits("from 0 to below 1", lambda part: 0.0 <= part 
 
 @dataclass(frozen=True)
 class ImageRig(CheckedSettings):
-    """Whatever sends depth images."""
+    """A sensor that sends depth images."""
 
     name: Name
     depth: str  # topic of its images
@@ -86,7 +86,7 @@ class BubbleRig(ImageRig):
 
 @dataclass(frozen=True)
 class ContactRig(CheckedSettings):
-    """How contacts follow from deformations (CHSEL, Sec. V-B; methods, Sec. 10.2)."""
+    """Thresholds by which contacts follow from deformations (CHSEL, Sec. V-B)."""
 
     filter: Annotated[int, positive] = 10  # side of the mean filter, pixels
     quantile: Quantile = 0.9
@@ -96,7 +96,7 @@ class ContactRig(CheckedSettings):
     threshold: Annotated[float, positive] = 0.004  # metres
     pixels: Annotated[int, positive] = 6  # fewer of them are no contact
     points: Annotated[int, positive] = 50
-    """Of a contact at most, a random subset, which the pads share."""
+    """Most points of a contact, a random subset, which the pads share."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class ForceRig(CheckedSettings):
     """Metres by which the line of force may miss the hand."""
 
     points: Annotated[int, positive] = 5
-    """Of a probe at most, the strongest of those in different voxels."""
+    """Most points of a probe, the strongest of those in different voxels."""
 
 
 @dataclass(frozen=True)
@@ -178,12 +178,16 @@ class GateRig(CheckedSettings):
     distance between neighbours where that is more."""
 
     part: Part = 0.05
-    """Of an object, regions with fewer pixels or points than this share of the largest are left
-    out; 0: none is for its size."""
+    """Share of the largest region of an object; regions with fewer pixels or points are left out.
+
+    With 0 none is left out for its size.
+    """
 
     speckle: Annotated[int, not_negative] = 100
-    """Where fewer pixels than this are connected, a camera's rays are free up to the least depth
-    around them alone; 0: nowhere."""
+    """Fewest connected pixels whose rays are free up to their depth.
+
+    Rays of fewer pixels are free up to the least depth around them alone; 0: none are.
+    """
 
 
 @dataclass(frozen=True)
@@ -204,7 +208,7 @@ class ExtraContacts(CheckedSettings):
 
 @dataclass(frozen=True)
 class Annotations:
-    """What a person knows about one log."""
+    """Knowledge of a person about one log."""
 
     exclude: tuple[int, ...] = ()  # probes whose contacts are not used
     contacts: tuple[ExtraContacts, ...] = ()
@@ -212,7 +216,7 @@ class Annotations:
 
 @dataclass(frozen=True)
 class ClockRig(CheckedSettings):
-    """Which times count."""
+    """Choice of the times that count."""
 
     stamp: Annotated[str, one_of("header", "log")] = "header"  # of the sender, or of the log
     offset: Annotated[float, positive] = 1.0
@@ -225,7 +229,7 @@ class ClockRig(CheckedSettings):
 
 @dataclass(frozen=True)
 class Rig(CheckedSettings):
-    """All about a rig."""
+    """A rig."""
 
     name: str
     world: str  # frame of the workspace and of all known points
@@ -261,22 +265,14 @@ class Rig(CheckedSettings):
         super().__post_init__()
         if self.workspace is not None:
             self.box()
-        names = [sensor.name for sensor in self.sensors]
-        if len(set(names)) < len(names):
-            raise SettingError(f"sensors are named {', '.join(names)}; accepted: each name once")
         if self.forces and (self.hand is None or not (self.hand.boxes or self.hand.urdf)):
             raise SettingError(
                 "forces need the solids of the hand, on which they act; accepted: hand.boxes, "
                 "hand.urdf"
             )
 
-    @property
-    def sensors(self) -> tuple[ImageRig, ...]:
-        """All that send depth images: the cameras, then the pads."""
-        return (*self.cameras, *self.bubbles)
-
     def box(self) -> Workspace:
-        """The workspace. Raises SettingError if there is none, PointsError if it is empty."""
+        """Return the workspace. Raise SettingError if there is none, PointsError if it is empty."""
         if self.workspace is None:
             raise SettingError("workspace is missing; accepted: [[x0, x1], [y0, y1], [z0, z1]]")
         (x0, x1), (y0, y1), (z0, z1) = self.workspace

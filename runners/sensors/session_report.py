@@ -1,4 +1,4 @@
-"""What a session reports of its log: counts by sensor and probe, and warnings."""
+"""The report of a source on its log: counts by sensor and probe, and warnings."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Counts:
     free: int = 0  # voxels that it was the first to mark as free
 
     def unused(self) -> str:
-        """How many messages were not used, by reason."""
+        """Return how many messages were not used, by reason."""
         reasons = {
             "outside of probes, or too soon after others": self.spared,
             "without a pose": self.lost,
@@ -37,7 +37,7 @@ class Counts:
         return ", ".join(f"{count} {reason}" for reason, count in reasons.items() if count)
 
     def left_out(self) -> str:
-        """How many pixels, points or forces were left out, by reason; "" if none were."""
+        """Return how many pixels, points or forces were left out, by reason; "" if none were."""
         reasons = {
             "without a value in range": self.invalid,
             "at edges of depth": self.edges,
@@ -60,11 +60,11 @@ class Report:
     lines: list[tuple[str, str]] = field(default_factory=list)
 
     def counts(self, step: int, sensor: str) -> Counts:
-        """The counts of a sensor in a probe."""
+        """Return the counts of a sensor in a probe."""
         return self.by_probe.setdefault(step, {}).setdefault(sensor, Counts())
 
     def total(self) -> dict[str, Counts]:
-        """By sensor, over all probes."""
+        """Return the counts of each sensor over all probes."""
         totals: dict[str, Counter[str]] = {}
         for by_sensor in self.by_probe.values():
             for name, counts in by_sensor.items():
@@ -75,21 +75,20 @@ class Report:
 class LogWarnings:
     """Lines of text in the order in which their kinds came up."""
 
-    def __init__(self, before: LogWarnings | None = None) -> None:
-        """before: whose lines come ahead."""
-        self._counts: Counter[tuple[str, str]] = Counter(before._counts if before else {})
+    def __init__(self) -> None:
+        self._counts: Counter[tuple[str, str]] = Counter()
 
     def warn(self, text: str, count: int = 1) -> None:
-        """Something is wrong, or was left out; `count` times."""
+        """Add a line: something is wrong, or was left out; `count` times."""
         if count:
             self._counts["warning", text] += count
 
     def note(self, text: str) -> None:
-        """Something worth knowing."""
+        """Add a line: something worth knowing."""
         self._counts["info", text] += 1
 
     def lines(self) -> list[tuple[str, str]]:
-        """Level and text of every kind; "(12 times)" stands behind what happened repeatedly."""
+        """Return level and text of every kind, with "(12 times)" behind what was repeated."""
         return [
             (level, text if count == 1 else f"{text} ({count} times)")
             for (level, text), count in self._counts.items()

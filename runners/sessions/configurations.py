@@ -1,4 +1,4 @@
-"""How an object lies before the gripper, and where it is probed: the paper's 17 configurations."""
+"""The paper's 17 configurations: the pose of an object before the gripper, and its probes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MESH_YAW = {"drill": -0.58, "mustard": -0.59, "cracker_box": 0.17, "spam_can": 0
 
 @dataclass(frozen=True)
 class Configuration:
-    """Where an object is let go, and the grid of its probes."""
+    """The place at which an object is let go, and the grid of its probes."""
 
     name: str
     object: str  # whose configuration it is
@@ -95,9 +95,9 @@ CONFIGURATIONS = {
 
 
 def find_configuration(name: str, object_name: str | None = None) -> Configuration:
-    """The configuration of the 17 called `name`; with `object_name`, one of that object's.
+    """Return the configuration `name` of the 17; with `object_name`, one of that object's.
 
-    An object that has no configurations of its own takes any. Raises SettingError for a name that
+    An object without configurations takes any. Raise SettingError for a name that
     is not accepted.
     """
     fitting = [key for key, one in CONFIGURATIONS.items() if one.object == object_name]

@@ -28,7 +28,7 @@ _OF_SESSION, _OF_NOISE, _OF_FOREIGN, _OF_FREE = range(4)
 
 
 def number_between(low: float, high: float, unit: str = "") -> Check:
-    """A number from `low` to `high`."""
+    """Return the check of a number from `low` to `high`."""
 
     def check(name: str, value: Any) -> None:
         if not low <= value <= high:
@@ -39,7 +39,7 @@ def number_between(low: float, high: float, unit: str = "") -> Check:
 
 @dataclass(frozen=True)
 class FaultSettings(CheckedSettings):
-    """What is wrong with what a session reports; by default nothing.
+    """Faults of what a source reports; by default none.
 
     Contacts get foreign ones beside them, are shifted by the camera's bias, get noise, and are
     rounded, in this order. The path of the hand and its true contacts do not depend on these.
@@ -66,7 +66,7 @@ class FaultSettings(CheckedSettings):
 
 CLEAN = "clean"
 OWN_LEVEL = "own"
-"""The name of faults that are none of the levels."""
+"""Name of faults that are none of the levels."""
 LEVELS: Mapping[str, FaultSettings] = {
     CLEAN: FaultSettings(),
     "noise_1mm": FaultSettings(contact_noise=0.001),
@@ -90,12 +90,12 @@ LEVELS: Mapping[str, FaultSettings] = {
 
 
 def level_name(faults: FaultSettings) -> str:
-    """The name of the level with these settings, else OWN_LEVEL."""
+    """Return the name of the level with these settings, else OWN_LEVEL."""
     return next((name for name, level in LEVELS.items() if level == faults), OWN_LEVEL)
 
 
 def probed_mesh(mesh: trimesh.Trimesh, faults: FaultSettings) -> trimesh.Trimesh:
-    """The mesh that is probed where `mesh` is registered, in the same frame, metres.
+    """Return the mesh that is probed where `mesh` is registered, in the same frame, metres.
 
     The centre of the bounding box stays, so that both have one true pose.
     """
@@ -119,7 +119,10 @@ class Faults:
         workspace: Workspace,
         seed: int,
     ) -> None:
-        """mesh: the probed one, metres, at world_from_object (4, 4). free: of the session."""
+        """Make the faults of a session.
+
+        mesh: the probed one, metres, at world_from_object (4, 4). free: of the session.
+        """
         self._settings, self._mesh, self._seed = settings, mesh, seed
         self.object_from_world = inverse(world_from_object)  # changes where pushes move it
         self._free, self._workspace = free, workspace
@@ -132,7 +135,7 @@ class Faults:
     def reported(
         self, step: int, contacts: FloatArray, normals_out: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Contacts (C', 3) and normals (C', 3) as reported of true ones (C, 3); the true first."""
+        """Return contacts (C', 3) and normals (C', 3) reported of true ones (C, 3); true first."""
         places, others = self._foreign_contacts(step, contacts)
         contacts = np.concatenate([contacts, places]) + self._bias
         noise = normals(self._stream(step, _OF_NOISE), contacts.shape)
@@ -143,7 +146,7 @@ class Faults:
         return contacts, np.concatenate([normals_out, others])
 
     def wrongly_free(self, step: int, swept: FloatArray) -> FloatArray:
-        """Centres (N', 3) of voxels inside the object reported free beside swept ones (N, 3).
+        """Return centres (N', 3) of voxels in the object reported free beside swept ones (N, 3).
 
         Each voxel has one chance in a session, when the first one beside it is swept.
         """
@@ -163,7 +166,7 @@ class Faults:
         return self._free.add(lattice.centres(voxels[chance < self._settings.free_error]))
 
     def _foreign_contacts(self, step: int, contacts: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Contacts (K, 3) off the object, with normals (K, 3) in any direction.
+        """Return contacts (K, 3) off the object, with normals (K, 3) in any direction.
 
         Their share is kept over the session, not drawn for every contact. Where no place fits, the
         contact comes with the next true one.
@@ -181,7 +184,7 @@ class Faults:
         return np.array(found).reshape(-1, 3), _directions(stream, len(found))
 
     def _place_beside(self, contact: FloatArray, stream: np.random.Generator) -> FloatArray | None:
-        """A place (3,) off the object in no voxel reported free; None if none was found."""
+        """Return a point (3,) off the object in no voxel reported free; None if none was found."""
         away = uniforms(stream, _NEAREST, self._settings.foreign_reach, (_TRIES, 1))
         places = contact + away * _directions(stream, _TRIES)
         lower, upper = self._workspace.bounds
@@ -190,14 +193,14 @@ class Faults:
         return places[np.argmax(fitting)] if fitting.any() else None
 
     def _in_bounds(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
-        """Which points (N, 3) are in the probed mesh's bounding box, padded by a margin, metres."""
+        """Return which points (N, 3) are in the probed mesh's bounding box, padded by a margin."""
         in_object, (lower, upper) = apply(self.object_from_world, points), self._mesh.bounds
         inside: BoolArray = (in_object >= lower - margin).all(axis=1)
         inside &= (in_object <= upper + margin).all(axis=1)
         return inside
 
     def _distance(self, points: FloatArray) -> FloatArray:
-        """Signed distance (N,) of points (N, 3) in the world to the probed mesh, metres."""
+        """Return signed distance (N,) of points (N, 3) in the world to the probed mesh, metres."""
         return mesh_sdf(self._mesh, apply(self.object_from_world, points))[0]
 
     def _stream(self, step: int, index: int) -> np.random.Generator:
@@ -205,6 +208,6 @@ class Faults:
 
 
 def _directions(stream: np.random.Generator, count: int) -> FloatArray:
-    """Unit vectors (count, 3), uniform over directions."""
+    """Return unit vectors (count, 3), uniform over directions."""
     drawn = normals(stream, (count, 3))
     return drawn / np.sqrt((drawn**2).sum(axis=1, keepdims=True))

@@ -1,4 +1,4 @@
-"""Where an object of any size stands before the hand, and a grid of probes that meet it."""
+"""The configuration of an object of any size, with a grid of probes that meet it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _BELOW = 3  # free voxels in the workspace below the object
 
 
 def fitted_configuration(mesh: trimesh.Trimesh, hand: ProbingHand) -> Configuration:
-    """The configuration FITTED of a mesh, in metres in its own frame, for a hand.
+    """Return the configuration FITTED of a mesh, in metres in its own frame, for a hand.
 
     The object lies as it would on the floor, on a stand so high that the hand can reach all of it
     from the side. Probes are spread over the width and height of its box and of the foremost part

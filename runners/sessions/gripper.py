@@ -1,4 +1,4 @@
-"""The gripper's control in simulated sessions, and what it asks of an engine."""
+"""The gripper's control in simulated sources, and the protocol of their engines."""
 
 from __future__ import annotations
 
@@ -26,16 +26,19 @@ _FARTHEST_BACK = 40  # times
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """What a gripper sees and feels at the end of a mini-step.
-
-    position (3,): of the hand, in the world. force: on the object, newtons. contact (3,) on the
-    object's surface, and its normal (3,) out of the object, where the hand is in contact.
-    """
+    """Measurements of a gripper at the end of a mini-step."""
 
     position: FloatArray
+    """Position (3,) of the hand, world."""
+
     force: float = 0.0
+    """Force on the object, newtons."""
+
     contact: FloatArray | None = None
+    """Point (3,) on the object's surface, world; None without contact."""
+
     normal: FloatArray | None = None
+    """Normal (3,) out of the object at the contact."""
 
 
 class Engine(Protocol):
@@ -57,24 +60,37 @@ class Engine(Protocol):
         """End the world. Ending twice is ending once."""
 
 
-class Gripper:
+class SimulatedGripper:
     """The hand's control: proportional, noisy, in control steps of MINI_STEPS mini-steps."""
 
+    path: list[FloatArray]
+    """Positions (3,) since `forget`, at the ends of mini-steps."""
+
+    ends: list[FloatArray]
+    """Positions (3,) since `forget`, at the ends of control steps."""
+
+    contacts: list[FloatArray]
+    """Points (3,) on the object since `forget`."""
+
+    normals: list[FloatArray]
+    """Outward normals (3,) of the object at the contacts."""
+
     def __init__(self, engine: Engine, settings: ProbingSettings, seed: int) -> None:
-        self._engine, self._settings = engine, settings
+        self._engine = engine
+        self._settings = settings
         stream = StreamKey(seed, 0).stream(Purpose.CONTROL_NOISE)
         self._noise = settings.noise * stream.standard_normal((NOISE_ROWS, 3))
         self._steps = 0
         self._position = np.array(START)
-        self.path: list[FloatArray] = [self._position]
+        self.path = [self._position]
         self.forget()
 
     def forget(self) -> None:
-        """Begin to write down positions and contacts anew."""
+        """Forget the positions and contacts so far, but for the last position."""
         self.path = self.path[-1:]
         self.ends = self.path[-1:]
-        self.contacts: list[FloatArray] = []
-        self.normals: list[FloatArray] = []
+        self.contacts = []
+        self.normals = []
 
     def move_to(self, y: float, z: float) -> None:
         """Go sideways to y and z, metres."""
@@ -95,7 +111,7 @@ class Gripper:
 
         length: of the way if nothing does, metres. If the object is at the start, the hand comes
         from behind it and goes so much farther.
-        Raises SessionError if there is no place behind the start, either.
+        Raise SessionError if there is no place behind the start, either.
         """
         direction = pose[:3, 2]
         start, left = self._clear_start(pose, length)

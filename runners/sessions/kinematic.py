@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import Lattice
 from chsel.problem.poses import apply
 from runners.sessions.gripper import START, Touch
 from runners.sessions.probing_hand import ProbingHand, turned_from_forward
@@ -30,7 +31,7 @@ class KinematicEngine:
         settings: ProbingSettings,
         hand: ProbingHand,
     ) -> None:
-        """mesh: metres, in its frame, at world_from_object (4, 4) until it is moved."""
+        """Put a mesh, metres, in its frame, at world_from_object (4, 4), until it is moved."""
         self._mesh = mesh
         self._patches = self._forward = _patches(hand)
         self._turn = np.eye(3)  # of the patches, from how a hand probes along x
@@ -81,7 +82,7 @@ class KinematicEngine:
         return not (self._object.closest(patches.points[close] + position)[0] < 0.0).any()
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Release nothing, as nothing is held."""
 
     def _touch(self, points: FloatArray, motion: FloatArray, length: float) -> Touch:
         """Bisect for when the first of points (S, 3) gets in; at the end of the way all are in."""
@@ -103,22 +104,23 @@ class KinematicEngine:
 
 @dataclass(frozen=True, eq=False)
 class _Patches:
-    """The hand's surface points (S, 3), their patches (S,), each one's centre and radius."""
+    """Points on the hand's surface, by patches."""
 
-    points: FloatArray
-    labels: np.ndarray
-    centres: FloatArray
-    radii: FloatArray
+    points: FloatArray  # (S, 3), metres
+    labels: np.ndarray  # (S,), indices of their patches
+    centres: FloatArray  # (P, 3), metres
+    radii: FloatArray  # (P,), metres, of all points of a patch around its centre
 
     def turned(self, turn: FloatArray) -> _Patches:
-        """The patches of a hand that is turned by (3, 3) about its origin."""
+        """Return the patches of a hand that is turned by (3, 3) about its origin."""
         return replace(self, points=self.points @ turn.T, centres=self.centres @ turn.T)
 
 
 @lru_cache(maxsize=2)
 def _patches(hand: ProbingHand) -> _Patches:
     points = hand.surface_points(SPACING)
-    _, labels = np.unique(np.rint(points / PATCH), axis=0, return_inverse=True)
+    voxels = Lattice((0.0, 0.0, 0.0), PATCH).voxels(points)
+    _, labels = np.unique(voxels, axis=0, return_inverse=True)
     count = np.bincount(labels)
     centres = np.stack([np.bincount(labels, axis) / count for axis in points.T], axis=1)
     radii = np.zeros(len(centres))
@@ -146,11 +148,11 @@ class _Surface:
         self._edge_normals = self._face_normals[:, None] + across  # by face and first corner
 
     def distance(self, points: FloatArray) -> FloatArray:
-        """Unsigned distance (N,) in metres at points (N, 3)."""
+        """Return unsigned distance (N,) in metres at points (N, 3)."""
         return np.sqrt(self._tree.squared_distance(self._vertices, self._faces, points)[0])
 
     def closest(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of points (N, 3): signed distance (N,), nearest points (N, 3), their normals (N, 3)."""
+        """Return signed distances (N,) of points (N, 3), nearest points (N, 3), and normals."""
         squared, face, nearest = self._tree.squared_distance(self._vertices, self._faces, points)
         triangles = self._vertices[self._faces[face]]
         weights = trimesh.triangles.points_to_barycentric(triangles, nearest)

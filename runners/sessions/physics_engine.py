@@ -15,7 +15,7 @@ _OUTPUTS = (1, 2)
 
 
 def connect(instead: str) -> Any:
-    """A world of its own; SessionError, which says what to do `instead`, without PyBullet."""
+    """Return a new world; SessionError, which says what to do `instead`, without PyBullet."""
     with silent():
         try:
             import pybullet

@@ -1,4 +1,4 @@
-"""How an object comes to lie on the floor: turned as a configuration says, and rolled to rest."""
+"""The pose of an object on the floor: turned as a configuration says, and rolled to rest."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MOST_ROLLS = 1000
 
 
 def laid_down(mesh: trimesh.Trimesh, configuration: Configuration) -> FloatArray:
-    """The pose world_from_object (4, 4) in which a configuration's object lies on the floor.
+    """Return the pose world_from_object (4, 4) of a configuration's object on the floor.
 
     The object is turned as the configuration says, sinks and rolls to rest, and is slid back until
     its centre of mass has the configuration's x and y.
@@ -28,36 +28,36 @@ def laid_down(mesh: trimesh.Trimesh, configuration: Configuration) -> FloatArray
 
 
 def on_stand(world_from_object: FloatArray, configuration: Configuration) -> FloatArray:
-    """The same pose (4, 4), from the floor onto what the configuration's object lies on."""
+    """Return a pose (4, 4) raised from the floor onto what the configuration's object lies on."""
     raised = world_from_object.copy()
     raised[2, 3] += configuration.stand
     return raised
 
 
 def spawn_pose(mesh: trimesh.Trimesh, configuration: Configuration) -> FloatArray:
-    """The pose world_from_object (4, 4) that a configuration gives its object, floor or not."""
+    """Return the pose world_from_object (4, 4) that a configuration states, floor or not."""
     own_yaw = axis_angle(np.eye(3)[2], MESH_YAW.get(configuration.object, 0.0))
     rotation = roll_pitch_yaw(np.array(configuration.rotation)) @ own_yaw
     return compose(rotation, np.array(configuration.position) - rotation @ centre_of_mass(mesh))
 
 
 def centre_of_mass(mesh: trimesh.Trimesh) -> FloatArray:
-    """Centre of mass (3,) in the mesh's frame; that of the convex hull where the mesh is open."""
+    """Return the centre of mass (3,) in the mesh's frame; of the convex hull of an open mesh."""
     solid = mesh if mesh.is_watertight else mesh.convex_hull
     return np.asarray(solid.center_mass, dtype=np.float64)
 
 
 def lowest(mesh: trimesh.Trimesh, world_from_object: FloatArray) -> float:
-    """Height in metres of the mesh's lowest point above the floor."""
+    """Return height in metres of the mesh's lowest point above the floor."""
     return float(apply(world_from_object, np.asarray(mesh.vertices))[:, 2].min())
 
 
 def roll_to_rest(mesh: trimesh.Trimesh, world_from_object: FloatArray) -> FloatArray:
-    """The pose (4, 4) in which a mesh rests that is put down on the floor without any swing.
+    """Return the pose (4, 4) in which a mesh rests that is put down on the floor gently.
 
     It sinks to the floor and, as long as its centre of mass is not above where it stands, tilts
     over the nearest point of support until its next vertex meets the floor.
-    Raises SessionError if it never comes to rest.
+    Raise SessionError if it never comes to rest.
     """
     vertices = np.asarray(mesh.convex_hull.vertices, dtype=np.float64)
     rotation, translation = world_from_object[:3, :3], world_from_object[:3, 3].copy()
@@ -78,7 +78,7 @@ def roll_to_rest(mesh: trimesh.Trimesh, world_from_object: FloatArray) -> FloatA
 
 
 def _tilt(placed: FloatArray, pivot: FloatArray, away: FloatArray) -> FloatArray:
-    """Rotation (3, 3) that tilts vertices (V, 3) over a pivot, towards `away` (2,), to the next."""
+    """Return the rotation (3, 3) that tilts vertices (V, 3) over a pivot to the next vertex."""
     direction = away / np.sqrt(away @ away)
     distance = (placed[:, :2] - pivot) @ direction
     height = placed[:, 2]
@@ -88,7 +88,7 @@ def _tilt(placed: FloatArray, pivot: FloatArray, away: FloatArray) -> FloatArray
 
 
 def _nearest_support(support: FloatArray, point: FloatArray) -> FloatArray:
-    """The point (2,) nearest to `point` of the polygon spanned by touching vertices (S, 2)."""
+    """Return the point (2,) nearest to `point` of the polygon of touching vertices (S, 2)."""
     try:
         hull = ConvexHull(support)
         corners = support[hull.vertices]

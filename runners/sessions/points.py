@@ -1,4 +1,4 @@
-"""A session whose known points come from a file."""
+"""A source whose known points come from a file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from chsel.errors import (
     SettingError,
     require_positive,
 )
-from chsel.events import Probe
+from chsel.events import Probe, Start
 from chsel.numerics.arrays import FloatArray, IntArray, frozen, read_npz, refuse_special_file
 from chsel.problem.points import (
     FREE_RESOLUTION,
@@ -39,6 +39,7 @@ from chsel.problem.poses import nearest_rigid
 from chsel.problem.sdf_grid import OBJECT_PADDING
 from chsel.problem.streams import LAST_STEP
 from runners.objects.loader import ObjectModel
+from runners.sessions.source import ObjectOrigin, ProbeSource, SourceKind
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class PointsSettings:
     """[[x0, x1], [y0, y1], [z0, z1]], metres; None: around the points, padded by the diameter."""
     free_resolution: float = FREE_RESOLUTION  # voxel side of free space, metres
     object_resolution: float | None = None
-    """Of the SDF grid, metres; None: by the object, see `ObjectModel.resolution`."""
+    """Spacing of the SDF grid, metres; None: by the object, see `ObjectModel.resolution`."""
     object_padding: float = OBJECT_PADDING  # of the SDF grid, metres
     start_contacts: int = 0  # a registration needs so many contacts
     start_probe: int = 0  # and this index of the probe
@@ -69,7 +70,7 @@ class PointsSettings:
             )
 
 
-class PointsSession:
+class PointsSource(ProbeSource):
     """Replays the steps of a file; a probe's index is the file's step; see `ProbeSource`.
 
     Raises PointsError for points that cannot be those of the object.
@@ -83,7 +84,8 @@ class PointsSession:
         self.world_from_object = self._file.world_from_object
         self.initial_points = KnownPoints()
         self.count = len(self._steps)
-        self.warnings: list[PointsWarning] = []  # about the file
+        self.start = Start(contacts=settings.start_contacts, step=settings.start_probe)
+        self.warnings: list[PointsWarning] = []
         self._points: list[KnownPoints] = []  # of each step
         every = KnownPoints()
         diameter = object_model.diameter
@@ -106,13 +108,24 @@ class PointsSession:
         self.workspace = given or workspace_around(every, object_model.grid(settings))
 
     def probes(self) -> Iterator[Probe]:
-        """One probe per step of the file."""
+        """Yield one probe per step of the file."""
         for step, points in zip(self._steps, self._points, strict=True):
             contacts = self._file.at(step).contacts
             yield Probe(step, "points", points, contacts=contacts, contact_normals=0.0 * contacts)
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Release nothing, as nothing is held open."""
+
+
+def open_points(
+    settings: PointsSettings, object_model: ObjectModel | None, seed: int
+) -> PointsSource:
+    """Open the source of a file, whatever the seed. Raise PointsError for unusable points."""
+    assert object_model is not None
+    return PointsSource(settings, object_model)
+
+
+POINTS = SourceKind(PointsSettings, open_points, ObjectOrigin.REAL)
 
 
 KINDS = ("surface", *POINT_CLASSES)
@@ -131,7 +144,7 @@ class PointFile:
     world_from_object: FloatArray | None = None  # (4, 4): the true pose, where it is given
 
     def at(self, step: int) -> KnownPoints:
-        """All that becomes known at a step; surface points are known points of distance 0."""
+        """Return all that becomes known at a step; surface points have distance 0."""
         surface, free, occupied, known = (
             np.flatnonzero((self.kinds == kind) & (self.steps == step)) for kind in KINDS
         )
@@ -143,7 +156,7 @@ class PointFile:
 def read_points(path: str | Path) -> PointFile:
     """Read .npz, .csv, or the vertices of .ply, .off, .xyz and .stl as surface points.
 
-    Raises PointsError, which names the file and the array or row, for anything malformed.
+    Raise PointsError, which names the file and the array or row, for anything malformed.
     """
     path = Path(path).expanduser()
     reader = _READERS.get(path.suffix.lower())
@@ -185,7 +198,7 @@ def _read_npz(path: Path) -> PointFile:
 
 
 def _npz_part(kind: str, arrays: dict[str, Any]) -> tuple[np.ndarray, ...]:
-    """Kinds, points, signed distances and steps of one array of points."""
+    """Return kinds, points, signed distances and steps of one array of points."""
     points = frozen(kind, arrays[kind], (None, 3))
     nothing = np.zeros(len(points), dtype=np.int64)
     sdf = frozen("known_sdf", arrays["known_sdf"] if kind == "known" else nothing, nothing.shape)
@@ -237,7 +250,7 @@ def _read_csv(path: Path) -> PointFile:
 
 
 def _wrong_length(path: Path) -> str:
-    """Which row of a .csv file has more values than there are columns; "" if none has."""
+    """Return which row of a .csv file has more values than columns; "" if none has."""
     with suppress(ValueError, csv.Error), path.open(newline="", encoding="utf-8-sig") as file:
         rows = csv.reader(file)
         columns = len(next(rows, ()))
@@ -249,7 +262,7 @@ def _wrong_length(path: Path) -> str:
 
 
 def _not_a_number(table: Any) -> str:
-    """The first value of a table that is not a number."""
+    """Return the first value of a table that is not a number."""
     for row, values in enumerate(table.itertuples(index=False), 1):
         for name, value in zip(table.columns, values, strict=True):
             try:
@@ -260,13 +273,13 @@ def _not_a_number(table: Any) -> str:
 
 
 def _unreadable(suffix: str, error: Exception) -> str:
-    """What a reader of a foreign format says, on one line."""
+    """Return what a reader of a foreign format says, on one line."""
     reason = " ".join(str(error).split()) or type(error).__name__
     return f"not a readable {suffix} file ({reason[:200]})"
 
 
 def _read_surface(path: Path) -> PointFile:
-    """Every vertex of a mesh or point cloud is a surface point, those at one place together one."""
+    """Return every vertex of a mesh or point cloud as a surface point, each place once."""
     import trimesh
 
     kind = path.suffix.lower().removeprefix(".")
@@ -282,7 +295,7 @@ def _read_surface(path: Path) -> PointFile:
 
 
 def _vertices(geometry: Any) -> FloatArray:
-    """All vertices (V, 3); of those of a mesh's faces, one for each place."""
+    """Return all vertices (V, 3); of those of a mesh's faces, one for each place."""
     import trimesh
 
     vertices = np.asarray(geometry.vertices, dtype=np.float64).reshape(-1, 3)

@@ -1,36 +1,39 @@
-"""Probe sessions with a gripper: what the physics engine and plain geometry have in common."""
+"""Sources that probe with a gripper, in a physics engine or by plain geometry."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from chsel.errors import SettingError
-from chsel.events import Probe
+from chsel.errors import MeshWarning, SettingError
+from chsel.events import Probe, Start
 from chsel.next_probe.action_lattice import (
     ActionSettings,
     around_actions,
     forward_actions,
     straight_actions,
 )
-from chsel.next_probe.decision_problem import Actions
+from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.streams import Purpose, StreamKey, normals
+from runners.objects.loader import ObjectModel
 from runners.sessions.configurations import (
     FITTED,
     WORKSPACE,
     Configuration,
     find_configuration,
 )
-from runners.sessions.faults import Faults, FaultSettings, probed_mesh
+from runners.sessions.faults import CLEAN, Faults, FaultSettings, probed_mesh
 from runners.sessions.fitted import fitted_configuration
-from runners.sessions.gripper import X_REST, Engine, Gripper
+from runners.sessions.gripper import X_REST, Engine, SimulatedGripper
 from runners.sessions.placement import centre_of_mass, laid_down, on_stand
 from runners.sessions.probing_hand import (
     ROTATION,
@@ -40,7 +43,7 @@ from runners.sessions.probing_hand import (
     world_from_gripper,
 )
 from runners.sessions.probing_settings import ProbingSettings, expected_moves
-from runners.sessions.source import require_available
+from runners.sessions.source import ObjectOrigin, SourceKind, Steerable, require_available
 
 if TYPE_CHECKING:
     import trimesh
@@ -50,33 +53,83 @@ SLAB_LAYERS = 2
 _TURN = 0.7  # standard deviation: the turn of an object pushed, by its way in diameters
 
 
+def _pybullet_engine(
+    mesh: trimesh.Trimesh,
+    configuration: Configuration,
+    settings: ProbingSettings,
+    hand: ProbingHand,
+) -> Engine:
+    from runners.sessions.simulated import PyBulletEngine
+
+    return PyBulletEngine(mesh, configuration, settings, hand)
+
+
+def _kinematic_engine(
+    mesh: trimesh.Trimesh,
+    configuration: Configuration,
+    settings: ProbingSettings,
+    hand: ProbingHand,
+) -> Engine:
+    from runners.sessions.kinematic import KinematicEngine
+
+    laid = on_stand(laid_down(mesh, configuration), configuration)
+    return KinematicEngine(probed_mesh(mesh, settings.faults), laid, settings, hand)
+
+
+ENGINES: Mapping[str, Callable[..., Engine]] = {
+    "simulated": _pybullet_engine,
+    "kinematic": _kinematic_engine,
+}
+"""Openers of the engines by the kinds of their sources, imported when they are used."""
+
+
 def open_probing(
     kind: str, mesh: trimesh.Trimesh, configuration_name: str, settings: ProbingSettings, seed: int
-) -> ProbingSession:
-    """A session of kind "simulated", in PyBullet, or "kinematic"; mesh in its own frame, metres.
+) -> ProbingSource:
+    """Open a source of a kind of ENGINES; mesh in its own frame, metres.
 
-    Raises SessionError for an unknown configuration, or where PyBullet is not installed.
+    Raise SettingError for an unknown configuration, SessionError where PyBullet is not installed.
     """
     hand = open_hand(settings.hand)
     if configuration_name == FITTED:
         configuration = fitted_configuration(mesh, hand)
     else:
         configuration = find_configuration(configuration_name)
-    engine: Engine
-    if kind == "kinematic":
-        from runners.sessions.kinematic import KinematicEngine
-
-        probed = probed_mesh(mesh, settings.faults)
-        laid = on_stand(laid_down(mesh, configuration), configuration)
-        engine = KinematicEngine(probed, laid, settings, hand)
-    else:
-        from runners.sessions.simulated import PyBulletEngine
-
-        engine = PyBulletEngine(mesh, configuration, settings, hand)
-    return ProbingSession(engine, mesh, configuration, settings, seed, hand)
+    engine = ENGINES[kind](mesh, configuration, settings, hand)
+    return ProbingSource(engine, mesh, configuration, settings, seed, hand)
 
 
-class ProbingSession:
+def _open_for_object(
+    kind: str, settings: ProbingSettings, object_model: ObjectModel | None, seed: int
+) -> ProbingSource:
+    """Open a source for an object. Raise SettingError if the configuration is another object's."""
+    assert object_model is not None
+    configuration = settings.configuration or object_model.configuration
+    if configuration != FITTED:
+        find_configuration(configuration, object_model.name)
+        if not object_model.of_paper:
+            text = (
+                f"configuration {configuration} is laid out for an object of the paper's size, and "
+                "its probes may miss this one; configuration=fitted is for any size"
+            )
+            warnings.warn(MeshWarning("other_size", text), stacklevel=2)
+    return open_probing(kind, object_model.mesh, configuration, settings, seed)
+
+
+PROBING: Mapping[str, SourceKind] = {
+    kind: SourceKind(
+        ProbingSettings,
+        partial(_open_for_object, kind),
+        ObjectOrigin.PLACED,
+        keys={"configuration": "${configuration}"},  # of the top file, for short commands
+        groups=({"faults": CLEAN},),
+    )
+    for kind in ENGINES
+}
+"""The kinds of sources that probe with a gripper, by name."""
+
+
+class ProbingSource(Steerable):
     """Probes one configuration with a gripper in either engine; see `ProbeSource`."""
 
     def __init__(
@@ -88,35 +141,45 @@ class ProbingSession:
         seed: int,
         hand: ProbingHand,
     ) -> None:
-        """mesh: the registered one, in its frame, metres. hand: that of the engine.
+        """Make the source of a registered mesh, in its frame, metres; hand: that of the engine.
 
-        Raises SettingError if nothing of the hand is deep enough to sweep.
+        Raise SettingError if nothing of the hand is deep enough to sweep.
         """
-        self.configuration, self.settings = configuration, settings
+        self.configuration = configuration
+        self.settings = settings
         self.workspace = choose_workspace(configuration, settings)
         self.free_resolution = settings.free_resolution or configuration.free_resolution
         self.world_from_object: FloatArray | None = engine.world_from_object
         self.count = len(configuration.grid)
-        self.push_distance, self._seed = expected_moves(vars(settings)), seed
+        self.start = Start(contacts=settings.start_contacts, step=settings.start_probe)
+        self.push_distance = expected_moves(vars(settings))
+        self._seed = seed
         self._voxels = FreeVoxels(Lattice(self.workspace.lower, self.free_resolution))
         self.initial_points = KnownPoints(
             free=self._voxels.add(self._boundary(mesh, engine.world_from_object))
         )
-        self.hand = hand.shape  # in its own frame, where it probes along z
+        self._hand = hand
         self._interior = hand.interior_points(settings.interior_spacing, settings.interior_depth)
         if len(self._interior) == 0:
             raise SettingError(
                 f"the hand has no interior point {settings.interior_depth:g} m deep; accepted: a "
                 "smaller session.interior_depth, or a finer session.interior_spacing"
             )
-        self._centre, self._diameter = centre_of_mass(mesh), float(np.linalg.norm(mesh.extents))
+        self._centre = centre_of_mass(mesh)
+        self._diameter = float(np.linalg.norm(mesh.extents))
         self._offered: Actions | None = None
         self._available = np.zeros(0, dtype=bool)
-        self._engine, self._gripper = engine, Gripper(engine, settings, seed)
+        self._engine = engine
+        self._gripper = SimulatedGripper(engine, settings, seed)
         self._faults: Faults | None = None
         if settings.faults != FaultSettings():
             probed, pose = probed_mesh(mesh, settings.faults), engine.world_from_object
             self._faults = Faults(settings.faults, probed, pose, self._voxels, self.workspace, seed)
+
+    @property
+    def hand(self) -> HandShape:
+        """The hand in its frame, where it probes along z."""
+        return self._hand.shape
 
     def probes(self) -> Iterator[Probe]:
         """Move before the object, push, return; once for every point of the grid."""
@@ -128,7 +191,7 @@ class ProbingSession:
             yield self._probe(step)
 
     def offer(self, settings: ActionSettings) -> Actions:
-        """The probes that can be chosen from; see `Steerable`."""
+        """Return the probes that can be chosen from; see `Steerable`."""
         push = self.settings.push_steps * self.settings.step_length
         if settings.choice == "around":
             offered = around_actions(settings, self.workspace, self.hand)
@@ -144,7 +207,7 @@ class ProbingSession:
         return offered
 
     def available(self) -> BoolArray:
-        """The actions (A,) that were not taken yet: again, they would show nothing new."""
+        """Return the actions (A,) that were not taken yet; repeated, they show nothing new."""
         return self._available.copy()
 
     def take(self, step: int, action: int) -> Iterator[Probe]:
@@ -157,11 +220,11 @@ class ProbingSession:
         yield self._probe(step, pose[:3, :3])
 
     def close(self) -> None:
-        """Let go of the engine."""
+        """Release the engine."""
         self._engine.close()
 
     def _probe(self, step: int, rotation: FloatArray = ROTATION) -> Probe:
-        """What the gripper has done since it last forgot, turned by a rotation world_from_hand."""
+        """Return what the gripper has done since `forget`, turned by a rotation world_from_hand."""
         done = self._gripper
         ends, contacts = np.array(done.ends), np.array(done.contacts).reshape(-1, 3)
         normals = np.array(done.normals).reshape(-1, 3)
@@ -182,7 +245,7 @@ class ProbingSession:
         return probe if probe.push is None else self._pushed(probe, probe.push)
 
     def _pushed(self, probe: Probe, direction: FloatArray) -> Probe:
-        """The same after the object has moved in a direction (3,), unless it stands."""
+        """Move the object in a direction (3,), unless it stands; return the probe with its pose."""
         if self.push_distance > 0.0:
             self._voxels.forget()  # what was free before has moved with the object
         if self.settings.moves == 0.0:
@@ -199,7 +262,7 @@ class ProbingSession:
         return replace(probe, world_from_object=pose)
 
     def _boundary(self, mesh: trimesh.Trimesh, world_from_object: FloatArray) -> FloatArray:
-        """Centres (N, 3) of the voxels where the object is known not to be."""
+        """Return centres (N, 3) of the voxels where the object is known not to be."""
         lattice, chosen = self._voxels.lattice, self.settings.boundary
         vertices = apply(world_from_object, np.asarray(mesh.vertices))
         parts = {"box_shell": box_shell(lattice, self.workspace)}
@@ -210,14 +273,14 @@ class ProbingSession:
 
 
 def choose_workspace(configuration: Configuration, settings: ProbingSettings) -> Workspace:
-    """The box in which the object is sought."""
+    """Return the box in which the object is sought."""
     if settings.workspace == "paper" and configuration.name != FITTED:
         return WORKSPACE
     return configuration.workspace
 
 
 def floor_slab(lattice: Lattice, vertices: FloatArray) -> FloatArray:
-    """Centres of the lattice's lowest layers, below the floor, under and around vertices (V, 3)."""
+    """Return centres of the lattice's lowest layers, under and around vertices (V, 3)."""
     low = lattice.voxels(vertices.min(axis=0, keepdims=True) - SLAB_MARGIN)[0]
     high = lattice.voxels(vertices.max(axis=0, keepdims=True) + SLAB_MARGIN)[0]
     low[2], high[2] = 0, SLAB_LAYERS - 1
@@ -225,7 +288,7 @@ def floor_slab(lattice: Lattice, vertices: FloatArray) -> FloatArray:
 
 
 def box_shell(lattice: Lattice, workspace: Workspace) -> FloatArray:
-    """Centres of one layer of voxels on the six faces of the workspace."""
+    """Return centres of one layer of voxels on the six faces of the workspace."""
     last = lattice.voxels(workspace.bounds[1:])[0]
     shell = np.ones(last + 1, dtype=bool)
     shell[1:-1, 1:-1, 1:-1] = False
@@ -233,7 +296,7 @@ def box_shell(lattice: Lattice, workspace: Workspace) -> FloatArray:
 
 
 def swept_voxels(lattice: Lattice, interior: FloatArray, positions: FloatArray) -> FloatArray:
-    """Centres of the voxels that interior (M, 3) meets at any of the hand's positions (P, 3)."""
+    """Return centres of the voxels that interior (M, 3) meets at one of positions (P, 3)."""
     bounds = np.array([positions.min(axis=0), positions.max(axis=0)])
     bounds += [interior.min(axis=0), interior.max(axis=0)]
     low, high = lattice.voxels(bounds)

@@ -13,6 +13,7 @@ import numpy as np
 from chsel.errors import SettingError
 from chsel.next_probe.decision_problem import HandShape
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import Lattice
 from chsel.problem.poses import compose
 from runners.sensors.hand import HandModel
 from runners.sensors.rig import BoxRig, HandRig
@@ -60,12 +61,12 @@ class ProbingHand:
 
     @cache  # noqa: B019  (there are few hands in a process)
     def surface_points(self, spacing: float) -> FloatArray:
-        """Points (S, 3) that cover the surface about `spacing` apart, all corners among them."""
+        """Return points (S, 3) that cover the surface about `spacing` apart, with all corners."""
         parts = [self._covering(index, spacing) for index in range(len(self.solids))]
         return np.concatenate(parts)
 
     def interior_points(self, spacing: float, depth: float) -> FloatArray:
-        """Nodes (M, 3) of a lattice through the origin that lie deeper than `depth` in a solid."""
+        """Return nodes (M, 3) of a lattice through the origin, deeper than `depth` in a solid."""
         bounds = np.array([solid.bounds for solid in self.solids])
         first = np.floor(bounds[:, 0].min(axis=0) / spacing)
         last = np.ceil(bounds[:, 1].max(axis=0) / spacing)
@@ -75,12 +76,13 @@ class ProbingHand:
         return nodes[deepest > depth]
 
     def _covering(self, index: int, spacing: float) -> FloatArray:
-        """Points on one solid that are in no other; of faces that two share, those of the first."""
+        """Return points on one solid that are in no other; on shared faces, the first solid's."""
         import trimesh
 
         solid = self.solids[index]
         fine, _ = trimesh.remesh.subdivide_to_size(solid.vertices, solid.faces, spacing)
-        _, kept = np.unique(np.rint(fine / spacing), axis=0, return_index=True)
+        voxels = Lattice((0.0, 0.0, 0.0), spacing).voxels(fine)
+        _, kept = np.unique(voxels, axis=0, return_index=True)
         points = np.concatenate([solid.vertices, fine[kept]])
         for other, beside in enumerate(self.solids):
             if other != index:
@@ -91,7 +93,7 @@ class ProbingHand:
 
 @cache
 def panda_hand() -> ProbingHand:
-    """A Franka hand with closed fingers, as two convex solids of its outer size.
+    """Return a Franka hand with closed fingers, as two convex solids of its outer size.
 
     The real hand is flat where these bulge by a few millimetres, so that they meet a flat object at
     one point.
@@ -104,9 +106,9 @@ def panda_hand() -> ProbingHand:
 
 
 def open_hand(described: DescribedHand) -> ProbingHand:
-    """The hand of a session.
+    """Return the hand of a session.
 
-    Raises SettingError for a URDF that cannot be used, and for a hand that is too long.
+    Raise SettingError for a URDF that cannot be used, and for a hand that is too long.
     """
     import trimesh
 
@@ -126,17 +128,17 @@ def open_hand(described: DescribedHand) -> ProbingHand:
 
 
 def turned_from_forward(rotation: FloatArray) -> FloatArray:
-    """The turn (3, 3), in the world, from probing along x to a rotation (3, 3) world_from_hand."""
+    """Return the turn (3, 3), world, from probing along x to a rotation (3, 3) world_from_hand."""
     return rotation @ ROTATION.T
 
 
 def world_from_gripper(positions: FloatArray, rotation: FloatArray = ROTATION) -> FloatArray:
-    """Poses (..., 4, 4) of a hand at positions (..., 3), turned by a rotation (3, 3)."""
+    """Return poses (..., 4, 4) of a hand at positions (..., 3), turned by a rotation (3, 3)."""
     return compose(np.broadcast_to(rotation, (*positions.shape[:-1], 3, 3)), positions)
 
 
 def _depth(solid: trimesh.Trimesh, points: FloatArray) -> FloatArray:
-    """Distance (N,) from points (N, 3) to the surface of a convex solid, negative outside.
+    """Return the distance (N,) of points (N, 3) to a convex solid's surface, negative outside.
 
     It is minus infinity outside of the solid's bounding box.
     """

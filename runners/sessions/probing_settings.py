@@ -1,4 +1,4 @@
-"""How the gripper of a simulated session probes, and what is written down of it."""
+"""Settings of sources that probe with a gripper."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ _STANDING = (("moves", 0.0), ("expect_moves", None))  # an object that stands st
 
 @dataclass(frozen=True)
 class ProbingSettings(CheckedSettings):
-    """How the gripper probes, and what is written down of it."""
+    """Settings of the gripper, of its probes, and of what is recorded of them."""
 
-    configuration: str | None = None  # one of the 17, or FITTED; None: the object's own
+    configuration: str | None = None  # one of the 17, or FITTED; None: the object's
     boundary: Annotated[str, one_of("floor_slab", "box_shell", "both")] = "floor_slab"
     """Voxels free from the start: two layers below the floor, the workspace's faces, or both."""
     workspace: Annotated[str, one_of("reference", "paper")] = "reference"
     """In "reference" the hammer's is larger; in "paper" all are alike."""
     sweep: Annotated[str, one_of("mini_steps", "control_steps")] = "mini_steps"
-    """Where free space is swept: all the way, or only where control steps end."""
+    """Positions at which free space is swept: all, or only those where control steps end."""
     collision_mesh: Annotated[str, one_of("visual", "vhacd")] = "visual"
-    """Of PyBullet: the mesh itself, or its convex parts."""
+    """Mesh in PyBullet: the mesh itself, or its convex parts."""
     # Side of a free voxel; None: 25 mm in the 17 configurations, as in the paper, 10 mm in FITTED.
     free_resolution: Length | None = None
     # Of the object's SDF grid; None: by the object, see `ObjectModel.resolution`.
@@ -53,7 +53,7 @@ class ProbingSettings(CheckedSettings):
     noise: Annotated[float, not_negative] = 0.005
     """Standard deviation, of a command between -1 and 1."""
     faults: FaultSettings = field(default_factory=FaultSettings)
-    """Of what is reported, and of the registered mesh."""
+    """Faults of what is reported, and of the registered mesh."""
     hand: DescribedHand = field(default_factory=DescribedHand)  # with which is probed
     # m: by which a push that touches the object then moves it. It turns about its centre, too: if
     # it is 0.2 m long, by a standard deviation of 1 degree for 5 mm, and less if it is longer.
@@ -73,13 +73,13 @@ class ProbingSettings(CheckedSettings):
 
 
 def expected_moves(session: Mapping[str, Any]) -> float:
-    """The largest distance per push that registration assumes by a session's settings, metres."""
-    told = session.get("expect_moves")
-    return float(session.get("moves", 0.0) if told is None else told)
+    """Return the largest distance per push that registration assumes, metres."""
+    expected = session.get("expect_moves")
+    return float(session.get("moves", 0.0) if expected is None else expected)
 
 
 def without_defaults(session: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a session as they are recorded: some only where they are not the default."""
+    """Return settings as they are recorded: some only where they are not the default."""
     defaults = {"faults": LEVELS[CLEAN], "hand": DescribedHand()}
     session = {k: v for k, v in session.items() if (k, v) not in _STANDING}
     return {

@@ -1,4 +1,4 @@
-"""A session that repeats the probes of an earlier recording, in its order or as actions."""
+"""A source that repeats the probes of an earlier recording, in its order or as actions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import PointsError, PoseError, SessionError, SettingError
-from chsel.events import Probe, Start
+from chsel.events import Probe, SessionStarted, Start
 from chsel.next_probe.action_lattice import ActionSettings, straight_actions
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
@@ -22,16 +22,16 @@ from chsel.problem.settings import build_settings
 from chsel.sensing.free_space import interior_lattice, poses_between
 from chsel.session.loop import Loop
 from replay.mcap.reader import read_recording
+from runners.objects.loader import ObjectModel
+from runners.sessions.probing import PROBING
 from runners.sessions.probing_hand import DescribedHand, open_hand
 from runners.sessions.probing_settings import ProbingSettings, expected_moves
-from runners.sessions.source import require_available
-
-_OF_GRIPPERS = ("simulated", "kinematic")  # sessions with a hand of ours
+from runners.sessions.source import ObjectOrigin, SourceKind, Steerable, require_available
 
 
 @dataclass(frozen=True)
 class RecordedSettings:
-    """A recording brings its own object, workspace and resolutions."""
+    """A recording, which brings the object, workspace and resolutions."""
 
     path: str | None = None  # the recording.mcap
     start_contacts: int | None = None  # a registration needs so many; None: as in the recording
@@ -42,7 +42,7 @@ class RecordedSettings:
             raise SettingError("path is missing; pass session.path=FILE, a recording.mcap")
 
 
-class RecordedSession:
+class RecordedSource(Steerable):
     """Gives the probes of a recording, with every point as it was.
 
     Raises RecordingError for a file that is not one, PointsError for points that cannot be those of
@@ -53,9 +53,13 @@ class RecordedSession:
         assert settings.path is not None
         recording = read_recording(settings.path)
         start = recording.start
-        self._recording, self.recorded, self._probes = recording, start, recording.probes
-        self.workspace, self.free_resolution = start.workspace, start.free_resolution
-        self.world_from_object, self.initial_points = start.world_from_object, start.initial_points
+        self._recording = recording
+        self._probes = recording.probes
+        self.recorded: SessionStarted = start
+        self.workspace = start.workspace
+        self.free_resolution = start.free_resolution
+        self.world_from_object = start.world_from_object
+        self.initial_points = start.initial_points
         self.count = len(self._probes)
         self._config: Mapping[str, Any] = start.config.get("session", {})
         self.push_distance = expected_moves(self._config) if start.moves is None else start.moves
@@ -68,7 +72,7 @@ class RecordedSession:
             raise PointsError(f"recording {settings.path}: {error}") from None
 
     def probes(self) -> Iterator[Probe]:
-        """The recorded probes in their order."""
+        """Yield the recorded probes in their order."""
         for probe in self._probes:
             if probe.world_from_object is not None:
                 self.world_from_object = probe.world_from_object
@@ -76,7 +80,7 @@ class RecordedSession:
 
     @cached_property
     def hand(self) -> HandShape:
-        """That of the recording, which probes along the z axis of its path; see `Steerable`.
+        """The recording's hand, which probes along the z axis of its path; see `Steerable`.
 
         Raises SessionError if the recording does not describe it.
         """
@@ -84,17 +88,17 @@ class RecordedSession:
             return self._recording.offered.hand
         if self._recording.rig is not None and self._recording.rig.hand is not None:
             return HandShape.of(self._recording.rig.hand)
-        if self.recorded.session not in _OF_GRIPPERS:
+        if self.recorded.session not in PROBING:
             raise SessionError(
                 f"recording {self._recording.path} does not describe the hand, so that its probes "
-                "cannot be chosen; accepted: a session of kind simulated or kinematic, or of "
+                f"cannot be chosen; accepted: a session of kind {' or '.join(PROBING)}, or of "
                 "sensors with solid parts of the hand in the rig"
             )
         described = build_settings(DescribedHand, self._config.get("hand", {}), "session.hand")
         return open_hand(described).shape
 
     def offer(self, settings: ActionSettings) -> Actions:
-        """The recorded probes, each as an action, whatever is chosen; see `Steerable`."""
+        """Return the recorded probes, each as an action, whatever is chosen; see `Steerable`."""
         if any(probe.world_from_object is not None for probe in self._probes):
             raise SessionError(
                 f"recording {self._recording.path} has an object that moved, so that its probes "
@@ -103,13 +107,13 @@ class RecordedSession:
         return self._actions.offer(settings)
 
     def available(self) -> BoolArray:
-        """The probes (A,) that were not taken yet."""
+        """Return the probes (A,) that were not taken yet."""
         return self._actions.available.copy()
 
     def take(self, step: int, action: int) -> Iterator[Probe]:
-        """A recorded probe as that of this step, with all of its path that is free.
+        """Yield a recorded probe as that of this step, with all of its path that is free.
 
-        What another one has shown before is not new. Raises SessionError if it was taken.
+        What another one has shown before is not new. Raise SessionError if it was taken.
         """
         require_available(action, self._actions.available)
         yield self._actions.take(step, action)
@@ -117,7 +121,7 @@ class RecordedSession:
     @cached_property
     def _actions(self) -> RecordedActions:
         hand, depth = self.hand, 0.0
-        if self.recorded.session in _OF_GRIPPERS:
+        if self.recorded.session in PROBING:
             depth = self._config.get("interior_depth", ProbingSettings.interior_depth)
         lattice = Lattice(self.workspace.lower, self.free_resolution)
         try:
@@ -148,7 +152,17 @@ class RecordedSession:
         return replace(self.start, steps=None if steps is None else tuple(sorted(steps)))
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Release nothing, as nothing is held open."""
+
+
+def open_recorded(
+    settings: RecordedSettings, object_model: ObjectModel | None, seed: int
+) -> RecordedSource:
+    """Open the source of a recording, whatever the seed. Raise RecordingError if it is none."""
+    return RecordedSource(settings)
+
+
+RECORDED = SourceKind(RecordedSettings, open_recorded, ObjectOrigin.RECORDED)
 
 
 def _start(settings: RecordedSettings, config: Mapping[str, Any]) -> Start:
@@ -173,16 +187,18 @@ class RecordedActions:
     """Probes that can be taken in any order, each once.
 
     A recording names each voxel of free space once, with the probe that swept it first. A probe
-    that is taken out of order sweeps again what earlier ones of the recording had swept: so much
+    that is taken out of order also sweeps what earlier ones of the recording had swept: so much
     of its path is free.
     """
 
     def __init__(
         self, probes: Sequence[Probe], hand: HandShape, lattice: Lattice, *, depth: float
     ) -> None:
-        """lattice: of the voxels of free space. depth: of the hand's interior that sweeps, metres.
+        """Make the actions of probes.
 
-        Raises SessionError for probes without a push along the hand's z axis.
+        lattice: of the voxels of free space. depth: of the hand's interior that sweeps, metres.
+
+        Raise SessionError for probes without a push along the hand's z axis.
         """
         self._probes, self._lattice = list(probes), lattice
         pushes = [_push(probe) for probe in self._probes]
@@ -203,12 +219,12 @@ class RecordedActions:
         self._voxels = lattice.voxels(self._free)  # (N, 3)
 
     def offer(self, settings: ActionSettings) -> Actions:
-        """An action for each probe, as long as the longest push of them; reach does not matter."""
+        """Return an action for each probe, as long as the longest push; reach does not matter."""
         length = np.full(len(self._starts), self._length)
         return straight_actions(replace(settings, reach=None), self._starts, length)
 
     def take(self, step: int, action: int) -> Probe:
-        """The probe of an action, as the one of this step."""
+        """Return the probe of an action, as the one of this step."""
         probe = self._probes[action]
         self.available[action] = False
         chosen = ~self._given & (self._first <= action)
@@ -220,7 +236,7 @@ class RecordedActions:
         return replace(probe, step=step, new_points=new)
 
     def _swept(self, voxels: np.ndarray, path: FloatArray) -> BoolArray:
-        """Which of voxels (N, 3) the hand's interior meets on a path (P, 4, 4)."""
+        """Return which of voxels (N, 3) the hand's interior meets on a path (P, 4, 4)."""
         if len(voxels) == 0 or len(self._interior) == 0:
             return np.zeros(len(voxels), dtype=bool)
         low = voxels.min(axis=0)
@@ -236,7 +252,7 @@ class RecordedActions:
 
 
 def _push(probe: Probe) -> tuple[FloatArray, float]:
-    """Where the push of a probe begins, a pose (4, 4), and how far it goes, metres."""
+    """Return where the push of a probe begins, a pose (4, 4), and how far it goes, metres."""
     path = probe.gripper_path
     if len(path) < 2:
         raise SessionError(
@@ -257,7 +273,7 @@ def _push(probe: Probe) -> tuple[FloatArray, float]:
 
 
 def _interior(hand: HandShape, spacing: float, depth: float) -> FloatArray:
-    """Points (M, 3) in the hand, deeper than `depth` in one of its bodies, in its frame."""
+    """Return points (M, 3) in the hand, deeper than `depth` in one of its bodies, in its frame."""
     import trimesh
 
     mesh = trimesh.Trimesh(hand.vertices, hand.faces, process=False)

@@ -1,4 +1,4 @@
-"""Sessions whose known points come from a robot's log, or from one depth image."""
+"""Sources whose known points come from a robot's log, or from one depth image."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from chsel.errors import SettingError
-from chsel.events import Logged, Probe, RigDescribed
+from chsel.events import Logged, Probe, RigDescribed, Start
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, check_points
 from chsel.problem.settings import CheckedSettings, not_negative, positive
@@ -26,16 +26,17 @@ from runners.sensors.depth_camera import (
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
 from runners.sensors.depth_frame import depth_frame_points, read_depth_frame
 from runners.sensors.first_pass import FirstPass
-from runners.sensors.hand import HandModel
+from runners.sensors.hand import HandModel, HandPath
 from runners.sensors.log.clocks import in_time_order
 from runners.sensors.log.messages import Received
 from runners.sensors.log.raw_log import RawLog
 from runners.sensors.pose_file import beside, read_pose
+from runners.sensors.registry import sensors_of
 from runners.sensors.rig import Rig
 from runners.sensors.second_pass import SecondPass
 from runners.sensors.session_report import LogWarnings, Report
 from runners.sessions.probing import box_shell
-from runners.sessions.source import ProbeEvent, ProbeSource
+from runners.sessions.source import ObjectOrigin, ProbeEvent, ProbeSource, SourceKind
 
 NO_POSE = "none"
 _FAR = 10.0  # m: from the world's origin, of no camera or object on or beside a table
@@ -53,7 +54,7 @@ class SensorsSettings(CheckedSettings):
     """File of the true pose; None: that beside the log, if there is one; "none": unknown."""
     free_resolution: Annotated[float, positive] = 0.01  # side of a free voxel, m
     object_resolution: Annotated[float, positive] | None = None
-    """Of the object's SDF grid, m; None: by the object, see `ObjectModel.resolution`."""
+    """Spacing of the object's SDF grid, m; None: by the object, see `ObjectModel.resolution`."""
     object_padding: Annotated[float, positive] = 0.05  # of the object's SDF grid, m
     start_contacts: Annotated[int, not_negative] = 4  # a registration needs so many contacts
     start_probe: Annotated[int, not_negative] = 0  # and this index of the probe
@@ -68,137 +69,170 @@ class SensorsSettings(CheckedSettings):
             )
 
 
-def open_sensors(settings: SensorsSettings, object_model: ObjectModel, seed: int) -> ProbeSource:
-    """The session of a log, or of a depth image. Raises SessionError if it cannot be used."""
-    path = Path(settings.path or "").expanduser()
-    if path.suffix.lower() in FRAME_SUFFIXES:
-        resolution, images = settings.free_resolution, settings.images
-        return DepthFrameSession(
-            path, settings.rig, object_model, free_resolution=resolution, images=images
-        )
-    return SensorsSession(settings, seed, diameter=object_model.diameter)
+def open_sensors(
+    settings: SensorsSettings, object_model: ObjectModel | None, seed: int
+) -> ProbeSource:
+    """Open the source of a log, or of a depth image. Raise SessionError if it cannot be used."""
+    assert object_model is not None
+    if Path(settings.path or "").suffix.lower() in FRAME_SUFFIXES:
+        return DepthFrameSource(settings, object_model)
+    return SensorsSource(settings, seed, diameter=object_model.diameter)
 
 
-class SensorsSession:
+SENSORS = SourceKind(
+    SensorsSettings,
+    open_sensors,
+    ObjectOrigin.REAL,
+    groups=({"presets/rig@rig": "default"}, {"rig": "cabinet"}),
+)
+
+
+class SensorsSource(ProbeSource):
     """Reads a log twice: what is small at once, images one after the other; see `ProbeSource`."""
 
     def __init__(
         self, settings: SensorsSettings, seed: int, *, diameter: float | None = None
     ) -> None:
-        """seed: of the choice of contact pixels. diameter: of the object, metres, where known.
+        """Open a log.
 
-        Raises SessionError for a log without use.
+        seed: of the choice of contact pixels. diameter: of the object, metres, where known.
+
+        Raise SessionError for a log without use.
         """
         path = Path(settings.path or "").expanduser()
         rig = settings.rig
-        self.report = Report()
+        self.report: Report = Report()
         self.workspace = rig.box()
         self.free_resolution = settings.free_resolution
+        self.start = Start(contacts=settings.start_contacts, step=settings.start_probe)
         self.world_from_object: FloatArray | None = None
-        self._rig, self._seed, self._images = rig, seed, settings.images
-        self._diameter, self._opening = diameter, LogWarnings()
-        self._hand = HandModel(rig.hand) if rig.hand else None
-        for text in self._hand.warnings if self._hand else ():
-            self._opening.warn(text)
+        self._rig = rig
+        self._diameter = diameter
+        self._lines = LogWarnings()
+        hand = HandModel(rig.hand) if rig.hand else None
+        for text in hand.warnings if hand else ():
+            self._lines.warn(text)
         self._log = RawLog(path)
         self._find_pose(path, settings.pose)
-        joints = self._hand.joint_names if self._hand else ()
-        sliding = self._hand.sliding if self._hand else ()
-        self._first_pass = FirstPass(
-            self._log, rig, joints, self._opening, lambda *_: None, sliding=sliding
+        sensors = sensors_of(rig, hand)
+        self._first_pass = FirstPass(self._log, rig, sensors, hand, warnings=self._lines)
+        free = FreeMap(self.workspace, self.free_resolution)
+        cell = RobotCell(
+            rig.world,
+            self._first_pass.tree,
+            gap=rig.clock.gap,
+            free=free,
+            warnings=self._lines,
+            gate=rig.gate,
+            diameter=diameter,
         )
-        missing = [name for name in joints if name not in self._first_pass.joints.first()]
-        if missing:
-            self._opening.warn(f"joints without a value are at 0: {', '.join(missing)}")
-        self.source = self._log.digest()
+        for sensor in sensors:
+            sensor.prepare(self._first_pass, cell)
+        self._first_pass.release()
+        path_of_hand = None
+        self._solids = None
+        if rig.hand is not None and hand is not None:
+            joints = self._first_pass.joints
+            path_of_hand = HandPath(rig.hand, hand, joints, times=cell.tree.times, cell=cell)
+            self._solids = hand.solids(joints.first())
+            missing = [name for name in hand.joint_names if name not in joints.first()]
+            if missing:
+                self._lines.warn(f"joints without a value are at 0: {', '.join(missing)}")
+        self._second_pass = SecondPass(
+            rig,
+            sensors,
+            path_of_hand,
+            cell=cell,
+            report=self.report,
+            seed=seed,
+            images=settings.images,
+        )
+        self._digest = self._log.digest()
         self.count = len(self._first_pass.windows)
-        self._free = FreeMap(self.workspace, self.free_resolution)
         if rig.boundary == "box_shell":
-            self._free.grid.at(box_shell(self._free.grid.lattice, self.workspace))
-        self.initial_points = KnownPoints(free=self._free.new())
+            free.grid.at(box_shell(free.grid.lattice, self.workspace))
+        self.initial_points = KnownPoints(free=free.new())
         annotated = {*rig.annotations.exclude, *(add.probe for add in rig.annotations.contacts)}
         for step in sorted(annotated - {window.step for window in self._first_pass.windows}):
-            self._opening.warn(f"the rig annotates probe {step}, which the log does not have")
+            self._lines.warn(f"the rig annotates probe {step}, which the log does not have")
 
     def probes(self) -> Iterator[ProbeEvent]:
-        """The probes of the log, in their order, once; its images are read as they go."""
-        rig, first_pass, warnings = self._rig, self._first_pass, LogWarnings(self._opening)
-        tree, gap, gate = first_pass.tree, rig.clock.gap, rig.gate
-        cell = RobotCell(rig.world, tree, gap, self._free, warnings, gate, self._diameter)
-        reading = SecondPass(
-            rig, first_pass, cell, self.report, self._hand, seed=self._seed, images=self._images
-        )
-        hand = self._hand.solids(first_pass.joints.first()) if self._hand else None
-        yield RigDescribed(-1, rig.name, self.source, hand)
+        """Yield the probes of the log, in their order, once; measurements are read as they go."""
+        first_pass = self._first_pass
+        yield RigDescribed(-1, self._rig.name, self._digest, self._solids)
         messages: Iterator[Received] = iter(())
-        if first_pass.bulky:
-            messages = self._log.messages(first_pass.bulky)
-        yield from reading.events(in_time_order(messages, first_pass.clocks.time))
-        reading.check()
+        if first_pass.measured():
+            messages = self._log.messages(first_pass.measured())
+        timed = in_time_order(messages, first_pass.clocks.time)
+        yield from self._second_pass.events(first_pass.windows, timed)
+        self._second_pass.check()
         for text, count in self._log.faults.items():
-            warnings.warn(text, count)
+            self._lines.warn(text, count)
         for name, counts in self.report.total().items():
             if left_out := counts.left_out():
-                warnings.note(f"{name}: {left_out}")
+                self._lines.note(f"{name}: {left_out}")
             if counts.edges > _MANY_EDGES * counts.pixels:
                 share = 100 * counts.edges // counts.pixels
-                warnings.warn(
+                self._lines.warn(
                     f"{name}: {share} % of its pixels are left out as "
                     "edges; a larger edge (m), or a smaller edge_reach (pixels), keeps more"
                 )
-        self.report.lines = warnings.lines()
+        self.report.lines = self._lines.lines()
         last = first_pass.windows[-1].step
         yield from (Logged(last, level, text) for level, text in self.report.lines)
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Release nothing, as nothing is held open."""
 
     def _find_pose(self, path: Path, chosen: str | None) -> None:
-        """The true pose, if there is a file of it."""
+        """Read the true pose, if there is a file of it."""
         if chosen == NO_POSE:
             return
         file = Path(chosen).expanduser() if chosen else beside(path)
         if chosen or file.is_file():
             self.world_from_object = read_pose(file)
-            place, (lower, upper) = self.world_from_object[:3, 3], self.workspace.bounds
-            beyond = np.maximum(np.maximum(lower - place, place - upper), 0.0)
+            position = self.world_from_object[:3, 3]
+            lower, upper = self.workspace.bounds
+            beyond = np.maximum(np.maximum(lower - position, position - upper), 0.0)
             away = float(np.sqrt((beyond**2).sum()))
             if away > (self._diameter or _FAR):
-                self._opening.warn(
+                self._lines.warn(
                     f"the true pose of {file.name} is {away:.3g} m outside of the workspace; check "
                     f"its unit, which is metres, and its frame, which is {self._rig.world}"
                 )
-            self._opening.note(f"the true pose is that of {file.name}")
+            self._lines.note(f"the true pose is that of {file.name}")
 
 
-class DepthFrameSession:
+class DepthFrameSource(ProbeSource):
     """The known points of a depth image as a single probe; see `ProbeSource`."""
 
-    def __init__(
-        self,
-        path: Path,
-        rig: Rig,
-        object_model: ObjectModel,
-        *,
-        free_resolution: float,
-        images: bool,
-    ) -> None:
-        self.report = Report()
-        self.free_resolution = free_resolution
+    def __init__(self, settings: SensorsSettings, object_model: ObjectModel) -> None:
+        self.report: Report = Report()
+        self.free_resolution = settings.free_resolution
         self.initial_points = KnownPoints()
         self.count = 1
-        self._rig, self._path, self._images = rig, path, images
-        self._frame = read_depth_frame(path)
-        diameter = object_model.diameter
+        self.start = Start(contacts=settings.start_contacts, step=settings.start_probe)
+        self._rig = settings.rig
+        self._path = Path(settings.path or "").expanduser()
+        self._images = settings.images
+        self._frame = read_depth_frame(self._path)
         self._points = depth_frame_points(
-            self._frame, rig, free_resolution=free_resolution, diameter=diameter
+            self._frame,
+            self._rig,
+            free_resolution=self.free_resolution,
+            diameter=object_model.diameter,
         )
         self.workspace = self._points.workspace
         self.world_from_object = self._frame.world_from_object
-        check_points(self._points.points, diameter, free_resolution, self.workspace)
+        check_points(
+            self._points.points,
+            object_model.diameter,
+            free_resolution=self.free_resolution,
+            workspace=self.workspace,
+        )
 
     def probes(self) -> Iterator[ProbeEvent]:
-        """The image, and what follows from it."""
+        """Yield the image, and the probe that follows from it."""
         found, (camera,) = self._points, self._rig.cameras
         self.report.by_probe[0] = {camera.name: found.counts}
         yield RigDescribed(-1, self._rig.name, file_digest(self._path))
@@ -215,7 +249,7 @@ class DepthFrameSession:
         yield Probe(0, "points", found.points)
 
     def _remarks(self, name: str) -> Iterator[tuple[str, str]]:
-        """Levels and texts on what was left out, and on what is suspicious."""
+        """Yield levels and texts on what was left out, and on what is suspicious."""
         found, label = self._points, self._points.labelled
         for warning in self._frame.camera.check_centre():
             yield "warning", f"{name}: {warning.text}"
@@ -249,4 +283,4 @@ class DepthFrameSession:
             yield "warning", f"{outside} of {len(known)} surface points are out of the workspace"
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Release nothing, as nothing is held open."""

@@ -48,7 +48,7 @@ class PyBulletEngine:
     ) -> None:
         """Settle the object of a configuration, fix it, and put the hand at its start.
 
-        Raises SessionError where PyBullet is not installed.
+        Raise SessionError where PyBullet is not installed.
         """
         self._max_force = settings.max_force
         self._readings: deque[_Reading | None] = deque(maxlen=READINGS)
@@ -56,7 +56,7 @@ class PyBulletEngine:
         self._world: Any = connect(
             "use session=kinematic, the same session without a physics engine"
         )
-        # Every access to a function of the client makes it anew; these are called most.
+        # Every access to a function of the client makes it; these are called most.
         self._step, self._contacts = self._world.stepSimulation, self._world.getContactPoints
         try:
             _set_up(self._world)
@@ -119,7 +119,7 @@ class PyBulletEngine:
             self._world.disconnect()
 
     def _read(self) -> _Reading | None:
-        """The contact between hand and object after a step: where it presses hardest."""
+        """Return the contact between hand and object after a step, where it presses hardest."""
         touching = self._contacts(self._hand, self._object)
         records = [record for record in touching if record[_FORCE] > 0.0]
         if not records:
@@ -142,7 +142,7 @@ _POINT_ON_B, _NORMAL_ON_B, _DISTANCE, _FORCE = 6, 7, 8, 9
 
 
 def _set_up(world: Any) -> None:
-    """Time steps and floor of a new world."""
+    """Set time steps and the floor of a new world."""
     world.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
     world.setTimeStep(TIME_STEP)
     floor = world.createMultiBody(0, world.createCollisionShape(world.GEOM_PLANE))
@@ -152,7 +152,7 @@ def _set_up(world: Any) -> None:
 
 
 def _settle(world: Any, mesh: trimesh.Trimesh, laid: FloatArray) -> FloatArray:
-    """The pose (4, 4) at which the mesh, put at `laid` on the floor, has settled under gravity.
+    """Return the pose (4, 4) at which the mesh has settled under gravity from pose `laid`.
 
     On a plane only the convex hull can touch; mass and inertia are those of the mesh itself.
     """
@@ -183,7 +183,7 @@ def _settle(world: Any, mesh: trimesh.Trimesh, laid: FloatArray) -> FloatArray:
 
 
 def _collision_file(world: Any, mesh: trimesh.Trimesh, folder: Path, kind: str) -> Path:
-    """A file with the mesh, or with its convex parts."""
+    """Return a file with the mesh, or with its convex parts."""
     whole, parts = folder / "object.obj", folder / "parts.obj"
     _write_obj(whole, [mesh])
     if kind == "visual":
@@ -202,7 +202,7 @@ def _fixed_object(world: Any, file: Path, world_from_object: FloatArray, concave
 
 
 def _hand(world: Any, hand: ProbingHand, folder: Path) -> int:
-    """The hand at its start. Without inertia the engine leaves its orientation alone."""
+    """Return the hand, put at its start; without inertia the engine keeps its orientation."""
     _write_obj(folder / "hand.obj", list(hand.solids))
     shape = world.createCollisionShape(world.GEOM_MESH, fileName=str(folder / "hand.obj"))
     body: int = world.createMultiBody(HAND_MASS, shape, basePosition=START)
@@ -217,7 +217,7 @@ def _hand(world: Any, hand: ProbingHand, folder: Path) -> int:
 
 
 def _placed(pose: FloatArray) -> dict[str, list[float]]:
-    """Arguments of createMultiBody that put a body at a pose (4, 4)."""
+    """Return arguments of createMultiBody that put a body at a pose (4, 4)."""
     quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
     return {"basePosition": pose[:3, 3].tolist(), "baseOrientation": quaternion.tolist()}
 

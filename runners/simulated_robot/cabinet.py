@@ -21,10 +21,11 @@ from runners.sensors.hand import box_mesh
 from runners.sensors.rig import BoxRig
 from runners.sessions.configurations import Configuration
 from runners.sessions.placement import laid_down
+from runners.sessions.probing_hand import ROTATION
 
 
 def _box(x: Sequence[float], y: Sequence[float], z: Sequence[float]) -> BoxRig:
-    """A box by its bounds along the world's axes."""
+    """Return a box by its bounds along the world's axes."""
     lower, upper = np.array([x, y, z]).T
     (sx, sy, sz), (px, py, pz) = (upper - lower).tolist(), ((upper + lower) / 2.0).tolist()
     return BoxRig((sx, sy, sz), (px, py, pz))
@@ -62,7 +63,7 @@ CABINET_CONFIGURATIONS = {
     )
     for name, y, z, place, yaw in _ALL
 }
-"""How an object stands on the shelf, and the grid of its probes (methods, Sec. 10.1).
+"""The objects on the shelf, and the grids of their probes (methods, Sec. 10.1).
 
 y, z: the wrist's offsets from its rest position, metres.
 """
@@ -72,13 +73,13 @@ CAMERA_TARGET = (0.86, 0.02, 0.44)  # m: what is in the middle of its image
 
 
 def mesh_of(boxes: Sequence[BoxRig]) -> trimesh.Trimesh:
-    """Boxes as one mesh, metres."""
+    """Return boxes as one mesh, metres."""
     joined: Any = trimesh.util.concatenate([box_mesh(box) for box in boxes])
     return joined
 
 
 def world_from_camera() -> FloatArray:
-    """Pose (4, 4) of the depth camera's optical frame; its image is level."""
+    """Return pose (4, 4) of the depth camera's optical frame; its image is level."""
     position = np.array(CAMERA_POSITION)
     forward = np.array(CAMERA_TARGET) - position
     forward /= np.sqrt(forward @ forward)
@@ -88,9 +89,9 @@ def world_from_camera() -> FloatArray:
 
 
 def stood_on_shelf(mesh: trimesh.Trimesh, configuration: Configuration) -> FloatArray:
-    """The pose world_from_object (4, 4) in which a mesh in metres stands in the cabinet.
+    """Return the pose world_from_object (4, 4) in which a mesh in metres stands in the cabinet.
 
-    Raises SessionError if it reaches out of the workspace.
+    Raise SessionError if it reaches out of the workspace.
     """
     world_from_object = laid_down(mesh, configuration)
     world_from_object[2, 3] += SHELF
@@ -106,8 +107,6 @@ def stood_on_shelf(mesh: trimesh.Trimesh, configuration: Configuration) -> Float
     return world_from_object
 
 
-ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-
 PADS = {"left": 1.0, "right": -1.0}  # on which side of the hand
 CAP = (0.042, 0.031, 0.022)  # m: semi-axes of a membrane, half an ellipsoid; x, y, z of its camera
 CAP_BASE = 0.055  # m: how far before the camera its rigid base is
@@ -118,18 +117,18 @@ _HOUSING = (0.086, 0.064, 0.080)  # m: the box behind the membrane
 
 
 def world_from_wrist(position: FloatArray) -> FloatArray:
-    """Pose (4, 4) of the wrist at position (3,); its orientation never changes."""
+    """Return pose (4, 4) of the wrist at position (3,); its orientation never changes."""
     return compose(ROTATION, position)
 
 
 def wrist_from_bubble_camera(pad: str) -> FloatArray:
-    """Pose (4, 4) of the camera that looks at a pad's membrane from inside, optical frame."""
+    """Return the pose (4, 4) of the camera that sees a pad's membrane from inside."""
     rotation, base = _pad(PADS[pad])
     return compose(rotation, base - CAP_BASE * rotation[:, 2])
 
 
 def rigid_parts() -> tuple[BoxRig, ...]:
-    """The solid parts of the hand, in its frame: arm, palm, and the pads without membranes."""
+    """Return the solid parts of the hand, in its frame: arm, palm, pads without membranes."""
     behind = _HOUSING[2] / 2.0
     y, z = PAD_SIDE - behind * sin(TILT), PAD_FRONT - behind * cos(TILT)
     return (
@@ -141,7 +140,7 @@ def rigid_parts() -> tuple[BoxRig, ...]:
 
 
 def whole_mesh() -> trimesh.Trimesh:
-    """The hand with its membranes untouched, in the wrist's frame, metres."""
+    """Return the hand with its membranes untouched, in the wrist's frame, metres."""
     meshes = [mesh_of(rigid_parts())]
     for side in PADS.values():
         cap = trimesh.creation.icosphere(subdivisions=3).apply_scale(CAP)
@@ -151,6 +150,6 @@ def whole_mesh() -> trimesh.Trimesh:
 
 
 def _pad(side: float) -> tuple[FloatArray, FloatArray]:
-    """Rotation (3, 3) of a pad, z outward, and the middle (3,) of its base, in the hand."""
+    """Return the rotation (3, 3) of a pad, z outward, and the middle (3,) of its base, hand."""
     rotation = axis_angle(np.array([1.0, 0.0, 0.0]), -side * TILT)
     return rotation, np.array([0.0, side * PAD_SIDE, PAD_FRONT])

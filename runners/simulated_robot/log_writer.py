@@ -34,7 +34,7 @@ class LogWriter:
     def add(
         self, topic: str, kind: str, message: Mapping[str, Any], stamp: int, log_time: int
     ) -> None:
-        """A message of a type of DEFINITIONS, sent at `stamp` and received at `log_time`."""
+        """Add a message of a type of DEFINITIONS, sent at `stamp` and received at `log_time`."""
         self._messages += 1
         heapq.heappush(self._waiting, (log_time, self._messages, topic, kind, message, stamp))
 
@@ -60,13 +60,13 @@ class LogWriter:
 
 
 def header(frame: str, stamp: int) -> dict[str, Any]:
-    """A std_msgs/Header."""
+    """Return a std_msgs/Header."""
     sec, nanosec = divmod(stamp, _SECOND)
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
 
 
 def transform(parent: str, child: str, parent_from_child: FloatArray, stamp: int) -> dict[str, Any]:
-    """A geometry_msgs/TransformStamped of a pose (4, 4)."""
+    """Return a geometry_msgs/TransformStamped of a pose (4, 4)."""
     quaternion = Rotation.from_matrix(parent_from_child[:3, :3]).as_quat()
     return {
         "header": header(parent, stamp),
@@ -79,7 +79,7 @@ def transform(parent: str, child: str, parent_from_child: FloatArray, stamp: int
 
 
 def image(frame: str, values: np.ndarray, stamp: int) -> dict[str, Any]:
-    """A sensor_msgs/Image of depths (H, W): uint16 or float32."""
+    """Return a sensor_msgs/Image of depths (H, W): uint16 or float32."""
     height, width = values.shape
     return {
         "header": header(frame, stamp),
@@ -93,7 +93,7 @@ def image(frame: str, values: np.ndarray, stamp: int) -> dict[str, Any]:
 
 
 def camera_info(frame: str, camera: PinholeCamera, stamp: int) -> dict[str, Any]:
-    """A sensor_msgs/CameraInfo of a camera without distortion."""
+    """Return a sensor_msgs/CameraInfo of a camera without distortion."""
     cx, cy, fx, fy = camera.cx, camera.cy, camera.fx, camera.fy
     return {
         "header": header(frame, stamp),
@@ -108,5 +108,5 @@ def camera_info(frame: str, camera: PinholeCamera, stamp: int) -> dict[str, Any]
 
 
 def joint_state(names: Sequence[str], positions: Sequence[float], stamp: int) -> dict[str, Any]:
-    """A sensor_msgs/JointState."""
+    """Return a sensor_msgs/JointState."""
     return {"header": header("", stamp), "name": names, "position": positions}

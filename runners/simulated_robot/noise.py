@@ -1,4 +1,4 @@
-"""What sensors make of depths: a stereo camera, worst at occlusion edges, and the bubbles' own."""
+"""The noise of depth sensors: a stereo camera, worst at occlusion edges, and the bubbles."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ BUBBLE_LOST = 0.001
 def stereo_depth(
     depth: FloatArray, camera: PinholeCamera, stream: np.random.Generator
 ) -> np.ndarray:
-    """What the outer camera measures of depths (H, W) in metres: uint16 millimetres, 0 for none.
+    """Return what the outer camera measures of depths (H, W), metres: uint16 mm, 0 for none.
 
     Whole patches are matched a little beside where they are, so that a band along every edge
     reports the wrong side of it; some pixels at edges float between both sides; pixels that only
@@ -53,7 +53,7 @@ def stereo_depth(
 
 
 def bubble_depth(depth: FloatArray, stream: np.random.Generator) -> np.ndarray:
-    """What a bubble's camera measures of depths (H, W) in metres: float32 metres, 0 for none."""
+    """Return what a bubble's camera measures of depths (H, W): float32 metres, 0 for none."""
     measured = depth + BUBBLE_NOISE * normals(stream, depth.shape)
     measured = np.rint(measured / BUBBLE_STEP) * BUBBLE_STEP
     return np.where(stream.random(depth.shape) < BUBBLE_LOST, 0.0, measured).astype(np.float32)
@@ -62,7 +62,7 @@ def bubble_depth(depth: FloatArray, stream: np.random.Generator) -> np.ndarray:
 def _strayed(
     depth: FloatArray, patch: float, stray: float, stream: np.random.Generator
 ) -> FloatArray:
-    """Depths (H, W), each taken from some pixels beside; near pixels stray alike."""
+    """Return depths (H, W), each taken from some pixels beside; near pixels stray alike."""
     height, width = depth.shape
     side = max(round(patch), 1)
     coarse = (2, -(-height // side) + 1, -(-width // side) + 1)
@@ -78,7 +78,7 @@ def _strayed(
 
 
 def _shadow(depth: FloatArray, focal_baseline: float) -> np.ndarray:
-    """Pixels (H, W) that the right eye does not see: in its image something nearer covers them.
+    """Return the pixels (H, W) that the right eye does not see, as something nearer covers them.
 
     There, pixel u is at u - focal * baseline / depth; what comes from further right covers it.
     """

@@ -22,7 +22,10 @@ _SPACING = 0.004  # m: between the points of the surface that are looked at firs
 
 
 class Membrane:
-    """rest (H, W): depth of the untouched membrane, metres; beside it is the rigid base."""
+    """A membrane that gives way, on its rigid base."""
+
+    rest: FloatArray
+    """Depth (H, W) of the untouched membrane, and of the base beside it, metres."""
 
     def __init__(self, camera: PinholeCamera) -> None:
         self.rest = _cap_depth(camera)
@@ -32,7 +35,7 @@ class Membrane:
         self._kept = 1.0 / (1.0 + (pitch / TAUTNESS) ** 2 / 4.0)
 
     def pressed(self, beyond: FloatArray) -> FloatArray:
-        """Depth (H, W) of the membrane where depth `beyond` (H, W) of what is outside allows.
+        """Return depth (H, W) of the membrane as depth `beyond` (H, W) of what is outside allows.
 
         The dent w is the least with w >= rest - beyond that elsewhere hangs as a taut sheet on a
         soft bed does, L^2 (w_xx + w_yy) = w with L = TAUTNESS, and ends where the base begins.
@@ -46,7 +49,7 @@ class Membrane:
         return depth
 
     def _hung(self, least: FloatArray, most: FloatArray) -> FloatArray:
-        """The dent (h, w) between bounds, by projected successive over-relaxation."""
+        """Return the dent (h, w) between bounds, by projected successive over-relaxation."""
         over = 2.0 / (1.0 + np.sqrt(1.0 - self._kept**2))
         rows, columns = np.indices(least.shape)
         even = (rows + columns) % 2 == 0
@@ -60,7 +63,7 @@ class Membrane:
 
 
 def _cap_depth(camera: PinholeCamera) -> FloatArray:
-    """Where the ray of every pixel (H, W) leaves the ellipsoid, or else meets the base; metres."""
+    """Return where the ray of every pixel (H, W) leaves the ellipsoid, or meets the base."""
     x, y = camera.columns, camera.rows[:, None]
     a, b, c = CAP
     # (x s / a)^2 + (y s / b)^2 + ((s - base) / c)^2 = 1, the further of the two depths s
@@ -73,7 +76,7 @@ def _cap_depth(camera: PinholeCamera) -> FloatArray:
 
 
 def _around(pixels: np.ndarray, margin: int) -> tuple[slice, slice]:
-    """The part of an image that holds these pixels (H, W) and a margin."""
+    """Return the part of an image that holds these pixels (H, W) and a margin."""
     rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
     return (
         slice(max(rows[0] - margin, 0), rows[-1] + margin + 1),
@@ -91,13 +94,13 @@ class Pads:
         mesh: trimesh.Trimesh,
         world_from_object: FloatArray,
     ) -> None:
-        """mesh: in its own frame, metres."""
+        """Make the pads against a mesh in its frame, metres."""
         fine, _ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _SPACING, max_iter=20)
         self._surface = apply(world_from_object, np.unique(fine, axis=0))
         self._scene, self._camera, self._membrane = scene, camera, Membrane(camera)
 
     def depths(self, world_from_wrist: FloatArray) -> dict[str, FloatArray]:
-        """Depth (H, W) in metres of each pad's membrane, pressed or not."""
+        """Return depth (H, W) in metres of each pad's membrane, pressed or not."""
         depths = {}
         for pad in PADS:
             world_from_camera = world_from_wrist @ wrist_from_bubble_camera(pad)
@@ -108,13 +111,13 @@ class Pads:
         return depths
 
     def touches(self, depths: dict[str, FloatArray]) -> bool:
-        """Whether so many pixels of a pad are dented, as the robot filters them, that it stops."""
+        """Return whether so many pixels of a pad are dented, as filtered, that the robot stops."""
         contact, rest = ContactRig(), self._membrane.rest
         dents = [ndimage.uniform_filter(rest - depth, contact.filter) for depth in depths.values()]
         return any((dent > contact.threshold).sum() >= contact.pixels for dent in dents)
 
     def _near(self, world_from_camera: FloatArray) -> bool:
-        """Whether the object comes within _SPACING of a membrane."""
+        """Return whether the object comes within _SPACING of a membrane."""
         points = apply(inverse(world_from_camera), self._surface) - [0.0, 0.0, CAP_BASE]
         near = ((points / (np.array(CAP) + _SPACING)) ** 2).sum(axis=1) < 1.0
         return bool((near & (points[:, 2] > -_SPACING)).any())

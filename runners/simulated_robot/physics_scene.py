@@ -27,7 +27,7 @@ class PhysicsScene:
     """An object at its pose in the cabinet, and the hand, which goes wherever it is put."""
 
     def __init__(self, mesh: trimesh.Trimesh, world_from_object: FloatArray) -> None:
-        """mesh: in its own frame, metres. Raises SessionError where PyBullet is not installed."""
+        """Make the scene of a mesh in its frame, metres. Raise SessionError without PyBullet."""
         self._world = connect("logs that it simulated can be read without it")
         surroundings = cabinet.mesh_of(cabinet.CABINET + cabinet.ROOM)
         with tempfile.TemporaryDirectory() as folder, silent():
@@ -50,7 +50,7 @@ class PhysicsScene:
         world_from_camera: FloatArray,
         world_from_wrist: FloatArray = _AWAY,
     ) -> FloatArray:
-        """Depth (H, W) along z in metres, camera.far where nothing is; without a wrist, no hand.
+        """Return depth (H, W) along z, metres, camera.far for nothing; without a wrist, no hand.
 
         Nothing nearer than camera.near is seen. Accurate to some micrometres.
         """
@@ -70,7 +70,7 @@ class PhysicsScene:
         return camera.near * camera.far / (camera.far - (camera.far - camera.near) * buffer)
 
     def clearance(self, world_from_wrist: FloatArray) -> float:
-        """Metres between the hand's rigid parts and anything, below 0 inside; NEAR at most."""
+        """Return metres between the hand's rigid parts and anything, below 0 inside; up to NEAR."""
         self._place(self._hand, world_from_wrist)
         nearest = [
             record[_DISTANCE]
@@ -84,12 +84,12 @@ class PhysicsScene:
         self._world.disconnect()
 
     def _look(self, file: Path, mesh: trimesh.Trimesh) -> int:
-        """What a mesh looks like, by way of a file."""
+        """Return the engine's shape of what a mesh looks like, by way of a file."""
         mesh.export(file)
         return int(self._world.createVisualShape(self._world.GEOM_MESH, fileName=str(file)))
 
     def _boxes(self, boxes: Sequence[BoxRig]) -> int:
-        """Boxes as one thing to touch."""
+        """Return the engine's shape of boxes as one body."""
         turns = [Rotation.from_euler("xyz", box.rotation).as_quat().tolist() for box in boxes]
         return int(
             self._world.createCollisionShapeArray(
@@ -112,7 +112,7 @@ class PhysicsScene:
 
 
 def _projection(camera: RenderedCamera) -> FloatArray:
-    """The engine's projection matrix. It looks through the lower left corner of every pixel."""
+    """Return the engine's projection matrix, through the lower left corner of every pixel."""
     cx, cy, near, far = camera.cx, camera.cy, camera.near, camera.far
     projection = np.zeros((4, 4))
     projection[0, 0] = 2.0 * camera.fx / camera.width

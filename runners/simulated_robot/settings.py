@@ -1,4 +1,4 @@
-"""How the simulated robot records: its sensors, and how often and how far it pushes."""
+"""Settings of the simulated robot: its sensors, and how often and how far it pushes."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ class BubbleSettings(CheckedSettings):
 
 
 def _centred(width: int, height: int, focal: float, near: float, far: float) -> RenderedCamera:
-    """A camera that looks through the middle of its image."""
+    """Return a camera that looks through the middle of its image."""
     cx, cy = (width - 1) / 2.0, (height - 1) / 2.0
     return RenderedCamera(width, height, focal, focal, cx, cy, near, far)
 
 
 @dataclass(frozen=True)
 class RobotSettings(CheckedSettings):
-    """How the robot probes and records."""
+    """Settings of the robot's probes and sensors."""
 
     probes: Annotated[int | None, positive] = None  # of the configuration's grid; null: all
     camera: CameraSettings = field(default_factory=CameraSettings)

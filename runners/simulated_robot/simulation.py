@@ -1,4 +1,4 @@
-"""The robot's sessions: the wrist pushes into the cabinet again and again, recorded in a log."""
+"""The robot's sessions: the wrist pushes into the cabinet repeatedly, recorded in a log."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ HOME = (0.48, 0.0, 0.433)  # m: where the wrist is before and after all probes
 PUSH_STEP = 0.05  # m
 PUSH_SPEED, MOVE_SPEED = 0.05, 0.15  # m/s
 SPREAD = 0.003  # m: standard deviation of the wrist's place in a probe
-REACTION = 1  # ticks that the robot still moves on when its pads have felt something
+REACTION = 1  # ticks that the robot still moves on when its pads are pressed
 PAUSE = 5  # ticks between the steps of a push
 
 # How long messages take to the log, seconds: at least, and that much more on average.
@@ -56,24 +56,24 @@ _SECONDS = TICK / 1e9  # of a tick
 
 @dataclass(frozen=True)
 class Push:
-    """A probe as it really was. y, z: of the wrist, metres. reach: metres that it went.
+    """A probe as it really was."""
 
-    stopped: by the "pads", the rigid "hand", or the "end" of its way.
-    """
-
-    step: int
-    y: float
-    z: float
-    reach: float
-    stopped: str
+    step: int  # index of the probe
+    y: float  # of the wrist, metres
+    z: float  # of the wrist, metres
+    reach: float  # metres that the wrist went
+    stopped: str  # by the "pads", the rigid "hand", or the "end" of its way
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedLog:
-    """What the log's readers are to find out. world_from_object (4, 4): of the mesh."""
+    """The truth about a log."""
 
     world_from_object: FloatArray
+    """True pose (4, 4) of the mesh."""
+
     pushes: tuple[Push, ...]
+    """Probes in their order."""
 
 
 def simulate_log(
@@ -175,7 +175,7 @@ class _Robot:
         return START + self._ticks * TICK
 
     def _enter(self, probe: int) -> None:
-        """From here on all noise is that of a probe."""
+        """Take all noise from now on from the streams of a probe."""
         self._key = StreamKey(self._seed, probe)
         self._latency = self._key.stream(Purpose.SENSOR_NOISE, 0)
         self._images = 0
@@ -217,7 +217,7 @@ class _Robot:
         camera: PinholeCamera,
         measure: Callable[[np.random.Generator], np.ndarray],
     ) -> None:
-        """An image, unless it is lost on its way. measure: makes it with the noise of a stream."""
+        """Send an image, unless it is lost; measure: makes it with the noise of a stream."""
         self._images += 1
         stream = self._key.stream(Purpose.SENSOR_NOISE, self._images)
         if stream.random() >= self._settings.drop:
@@ -239,7 +239,7 @@ class _Robot:
 
 
 def _line(start: FloatArray, end: FloatArray, speed: float) -> Iterator[FloatArray]:
-    """Where the wrist (3,) is at the ticks of its way; the last is its end."""
+    """Yield the positions (3,) of the wrist at the ticks of its way; the last is its end."""
     way = end - start
     ticks = int(np.ceil(np.sqrt(way @ way) / (speed * _SECONDS) - 1e-9))
     for tick in range(1, ticks + 1):

@@ -29,7 +29,7 @@ from chsel.problem.streams import StreamKey
 from replay.__main__ import main
 from replay.mcap.reader import read_recording
 from replay.verbs.export import EXPORTS, exported_archive, exported_modes
-from runners.sessions.points import PointsSession, PointsSettings
+from runners.sessions.points import PointsSettings, PointsSource
 from tests.chsel.samples import REPOSITORY, box_with_knob, hypotheses_at
 from tests.replay.conftest import same_bits
 from tests.tools.small_recordings import registered_session
@@ -71,7 +71,7 @@ def test_a_points_session_on_exported_points_has_the_recorded_problems(recording
     path = exported(recording, "points", file_format)
     workspace = tuple(zip(*recording.start.workspace.bounds.tolist(), strict=True))
     large: Any = SimpleNamespace(diameter=5.0)
-    session = PointsSession(PointsSettings(str(path), workspace), large)
+    session = PointsSource(PointsSettings(str(path), workspace), large)
     assert session.workspace == recording.start.workspace
     points, steps = KnownPoints(), []
     for probe, original in zip(session.probes(), recording.probes, strict=True):

@@ -14,7 +14,7 @@ from replay.comparing.verification import EQUAL, verify
 from replay.mcap.reader import read_recording
 from runners import evaluate, probe
 from runners.sessions.placement import centre_of_mass
-from runners.sessions.recorded import RecordedSession, RecordedSettings
+from runners.sessions.recorded import RecordedSettings, RecordedSource
 from tests.runners.in_process import run
 
 MOVES = 0.01  # m
@@ -72,7 +72,7 @@ def test_recorded_problems_with_pushes_give_the_recorded_bits(recording):
     )
     verdicts = list(verify(recording))
     assert {verdict.outcome for verdict in verdicts} == {EQUAL}
-    session = RecordedSession(RecordedSettings(str(recording.path)))
+    session = RecordedSource(RecordedSettings(str(recording.path)))
     loop = session.loop(OnlineSettings(), seed=recording.seed)
     assert [problem.pushes.digest for problem in loop.problems(session.probes())] == [
         recording.problem(step).pushes.digest for step in recording.steps

@@ -16,7 +16,7 @@ from runners.evaluation.metrics import HypothesisMetrics, MetricsConfig
 from runners.evaluation.plan import Task
 from runners.evaluation.run_method import ResultRows
 from runners.evaluation.trial_session import open_recorded, problems
-from runners.sessions.recorded import RecordedSession
+from runners.sessions.recorded import RecordedSource
 from tests.runners.in_process import do_task
 from tests.runners.test_evaluation import TRIAL, plan_in
 
@@ -28,7 +28,7 @@ class Scene:
     """The rows of a trial, with the problem of one step and its plausible set."""
 
     rows: ResultRows
-    session: RecordedSession
+    session: RecordedSource
     truth: FloatArray  # world_from_object (4, 4)
     problem: RegistrationProblem
     members: PlausibleSet

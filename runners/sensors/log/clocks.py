@@ -40,12 +40,12 @@ class Clocks:
             times[1].append(received.stamp or 0)
 
     def of(self, topic: str) -> tuple[IntArray, IntArray]:
-        """The log's times (N,) and stamps (N,), 0: none, of a topic's messages, nanoseconds."""
+        """Return log times (N,) and stamps (N,), 0: none, of a topic's messages, nanoseconds."""
         log_times, stamps = self._times.get(topic, (array("q"), array("q")))
         return np.array(log_times, dtype=np.int64), np.array(stamps, dtype=np.int64)
 
     def correction(self) -> ClockCorrection:
-        """What must be added to the times of each topic, by all messages so far."""
+        """Return what must be added to the times of each topic, by all messages so far."""
         medians: dict[str, int] = {}
         several: dict[str, list[int]] = {}
         small_steps: dict[str, float] = {}  # seconds
@@ -112,7 +112,7 @@ class ClockCorrection:
     warnings: tuple[str, ...] = ()  # what a user should know of the clocks
 
     def times(self, topic: str, log_times: Any, stamps: Any) -> IntArray:
-        """When messages (N,) were true, nanoseconds: by their stamps, where they can be."""
+        """Return when messages (N,) were true, nanoseconds: by their stamps, where possible."""
         logged, sent = np.asarray(log_times, np.int64), np.asarray(stamps, np.int64)
         if self.by_log:
             return logged
@@ -124,7 +124,7 @@ class ClockCorrection:
         return np.clip(times, 0, _END_OF_TIME)
 
     def time(self, received: Received) -> int:
-        """When one message was true, nanoseconds."""
+        """Return when one message was true, nanoseconds."""
         return int(self.times(received.topic, received.log_time, received.stamp or 0))
 
 
@@ -190,7 +190,7 @@ def _seconds(nanoseconds: float) -> str:
 def in_time_order(
     messages: Iterable[Received], time_of: Callable[[Received], int]
 ) -> Iterator[tuple[int, Received]]:
-    """Times and messages, by time; what comes too late for its place comes when it comes."""
+    """Yield times and messages, by time; a message that is too late comes when it comes."""
     waiting: list[tuple[int, int, Received]] = []
     for count, message in enumerate(messages):
         heapq.heappush(waiting, (time_of(message), count, message))

@@ -6,14 +6,15 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from mcap.records import Schema
 
+from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
-from chsel.sensing.depth_camera import PinholeCamera
+from chsel.sensing.depth_camera import PinholeCamera, matrix_numbers
 from replay.mcap.texts import one_line
 from runners.sensors.log.images import compressed_pixels, pixel_rows
 from runners.sensors.log.messages import (
@@ -34,7 +35,7 @@ _NANOSECONDS = 10**9
 _END_OF_TIME = 2**63
 _FURTHEST = 1e9  # metres: no robot works further from the origin of its frame
 _FLOATS = {7: "f4", 8: "f8"}  # in sensor_msgs/PointField and foxglove.PackedElementField alike
-_LEAST_SKEW = 0.001  # of a focal length: less is no matter
+_MOST_SKEW = 0.001  # of a focal length: less does not matter
 _AXES = ("x", "y", "z")
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begin of a frame of zstd; messages of CDR begin with 0
 _COMPRESSED = UnusableMessage(
@@ -78,7 +79,7 @@ def decoder(name: str, encoding: str, definition: str | None = None) -> Decode:
 
 
 def _checked(name: str, read: Callable[[Any], Any], given: Any) -> Any:
-    """What `read` returns; as UnusableMessage what it raises, which libraries do as they like."""
+    """Return what `read` returns, or its exception as UnusableMessage; libraries raise anything."""
     try:
         return read(given)
     except UnusableMessage as error:
@@ -91,7 +92,7 @@ def _checked(name: str, read: Callable[[Any], Any], given: Any) -> Any:
 def _reader(
     name: str, encoding: str, definition: str | None
 ) -> tuple[Callable[[bytes], Any], Read]:
-    """What parses messages of a schema, and what reads their content."""
+    """Return what parses messages of a schema, and what reads their content."""
     short = name.replace("/msg/", "/")
     if encoding == "cdr" and short in _ROS2:
         return _ros2_parser(short, definition), _ROS2[short]
@@ -121,7 +122,7 @@ def _ros2_parser(name: str, definition: str | None) -> Callable[[bytes], Any]:
 
 
 def _header(message: Any) -> tuple[int | None, str]:
-    """The time stamp, nanoseconds, None where there is none, and the frame of a message."""
+    """Return the stamp, nanoseconds, None where there is none, and the frame of a message."""
     if hasattr(message, "header"):  # of ROS 2
         time, frame = message.header.stamp, message.header.frame_id
         stamp = time.sec * _NANOSECONDS + time.nanosec
@@ -135,7 +136,7 @@ def _header(message: Any) -> tuple[int | None, str]:
 
 
 def _frame_name(name: str) -> str:
-    """The name of a frame without the slash that old programs put ahead."""
+    """Return the name of a frame without the slash that old programs put ahead."""
     return one_line(name.removeprefix("/"))
 
 
@@ -155,57 +156,51 @@ def _compressed_image(message: Any, frame: str) -> ImageMessage:
 
 
 def _ros2_camera(message: Any, _: str) -> CameraInfoMessage:
-    """Of the pixels that are sent: a region of the sensor, and several of its pixels as one."""
-    region, across, down = message.roi, max(message.binning_x, 1), max(message.binning_y, 1)
+    """Return intrinsics of the pixels that are sent: a region of the sensor, binned."""
+    info = _camera(message.width, message.height, k=message.k, p=message.p, d=message.d)
+    region = message.roi
+    across = max(message.binning_x, 1)
+    down = max(message.binning_y, 1)
 
-    def camera(numbers: Numbers) -> PinholeCamera:
+    def sent(camera: PinholeCamera) -> PinholeCamera:
         return PinholeCamera(
-            (region.width or message.width) // across,
-            (region.height or message.height) // down,
-            numbers.fx / across,
-            numbers.fy / down,
-            (numbers.cx - region.x_offset) / across,
-            (numbers.cy - region.y_offset) / down,
+            width=(region.width or camera.width) // across,
+            height=(region.height or camera.height) // down,
+            fx=camera.fx / across,
+            fy=camera.fy / down,
+            cx=(camera.cx - region.x_offset) / across,
+            cy=(camera.cy - region.y_offset) / down,
         )
 
-    return _camera(camera, message.k, message.p, message.d)
-
-
-def _camera(
-    camera: Callable[[Numbers], PinholeCamera], k: Any, p: Any, d: Any
-) -> CameraInfoMessage:
-    """k, p, d: matrices of the camera as it is (9) and rectified (12, or none), distortion."""
-    rectified = None
-    if len(p) == 12 and p[0] != 0.0:
-        with suppress(UnusableMessage):  # who rectifies no images may leave anything there
-            rectified = camera(_intrinsics("P", [*p[:3], *p[4:7], *p[8:11]]))
-    return CameraInfoMessage(camera(_intrinsics("K", k)), any(d), rectified)
-
-
-class Numbers(NamedTuple):
-    """Focal lengths and principal point of a whole sensor, pixels."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-
-def _intrinsics(name: str, matrix: Any) -> Numbers:
-    """The numbers in a matrix of a camera (9), row by row."""
-    fx, skew, cx, zero, fy, cy, *last = (float(value) for value in matrix)
-    straight = abs(skew) <= _LEAST_SKEW * abs(fx) and zero == 0.0 and last == [0.0, 0.0, 1.0]
-    if not (straight and np.isfinite([fx, fy, cx, cy]).all()):
-        listed = ", ".join(f"{value:g}" for value in matrix)
-        raise UnusableMessage(f"{name} is [{listed}]; accepted: fx, 0, cx, 0, fy, cy, 0, 0, 1")
-    return Numbers(fx, fy, cx, cy)
+    rectified = None if info.rectified is None else sent(info.rectified)
+    return CameraInfoMessage(sent(info.camera), info.distorted, rectified)
 
 
 def _foxglove_camera(message: Any, _: str) -> CameraInfoMessage:
-    size = message.width, message.height
-    return _camera(
-        lambda numbers: PinholeCamera(*size, **numbers._asdict()), message.K, message.P, message.D
-    )
+    return _camera(message.width, message.height, k=message.K, p=message.P, d=message.D)
+
+
+def _camera(width: int, height: int, *, k: Any, p: Any, d: Any) -> CameraInfoMessage:
+    """Return intrinsics of all pixels of a sensor.
+
+    k: matrix (9) of images as they are. p: matrix (12, or none) of rectified ones. d: distortion.
+    """
+    rectified = None
+    if len(p) == 12 and p[0] != 0.0:
+        with suppress(UnusableMessage):  # who rectifies no images may leave anything there
+            rectified = _pinhole("P", [*p[:3], *p[4:7], *p[8:11]], width=width, height=height)
+    return CameraInfoMessage(_pinhole("K", k, width=width, height=height), any(d), rectified)
+
+
+def _pinhole(name: str, numbers: Any, *, width: int, height: int) -> PinholeCamera:
+    """Return the camera of a matrix (9), row by row."""
+    try:
+        fx, fy, cx, cy = matrix_numbers(np.reshape(numbers, (3, 3)), skew=_MOST_SKEW)
+    except SettingError:
+        listed = ", ".join(f"{value:g}" for value in numbers)
+        text = f"{name} is [{listed}]; accepted: fx, 0, cx, 0, fy, cy, 0, 0, 1"
+        raise UnusableMessage(text) from None
+    return PinholeCamera(width, height, fx=fx, fy=fy, cx=cx, cy=cy)
 
 
 def _ros2_cloud(message: Any, frame: str) -> CloudMessage:
@@ -276,12 +271,12 @@ def _log(message: Any, _: str) -> str:
 
 
 def _pair(message: Any, _: str) -> str:
-    """A key "begin" with value "3" is the text "begin 3"."""
+    """Return key and value as a text, such as "begin 3" of "begin" and "3"."""
     return one_line(f"{message.key} {message.value}")
 
 
 def rigid(position: Any, quaternion: Any) -> FloatArray:
-    """The transform (4, 4) of a position x, y, z, metres, and a quaternion of any length."""
+    """Return the transform (4, 4) of x, y, z, metres, and a quaternion of any length."""
     numbers = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     place = position.x, position.y, position.z
     largest = max(map(abs, numbers))
@@ -302,7 +297,7 @@ def rigid(position: Any, quaternion: Any) -> FloatArray:
 
 
 def _positions(points: Iterable[Any]) -> FloatArray:
-    """Points (N, 3) of objects that have x, y and z."""
+    """Return points (N, 3) of objects that have x, y and z."""
     return np.array([(p.x, p.y, p.z) for p in points]).reshape(-1, 3)
 
 
@@ -315,7 +310,9 @@ def packed_points(
     row: int,
     big_endian: bool = False,
 ) -> FloatArray:
-    """Points (N, 3) of `stride` bytes each; size: points a row, and rows of `row` bytes.
+    """Return points (N, 3) of `stride` bytes each, in rows.
+
+    size: points a row, and rows of `row` bytes.
 
     fields: offset in bytes and type by name.
     """

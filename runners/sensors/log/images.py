@@ -22,7 +22,10 @@ _FORMATS = {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF"}
 def pixel_rows(
     data: bytes, encoding: str, size: tuple[int, int], step: int, *, big_endian: bool = False
 ) -> np.ndarray:
-    """Values (H, W), uint16 or float32, of rows of `step` bytes; size: width, height, pixels."""
+    """Return values (H, W), uint16 or float32, of rows of `step` bytes.
+
+    size: width, height, pixels.
+    """
     width, height = size
     if encoding not in _KINDS:
         kinds = ", ".join(_KINDS)
@@ -40,7 +43,9 @@ def pixel_rows(
 
 
 def compressed_pixels(data: bytes, image_format: str) -> np.ndarray:
-    """Values (H, W) of a PNG, as sensor_msgs/CompressedImage has it: uint16, or float32, metres.
+    """Return values (H, W) of a PNG, as sensor_msgs/CompressedImage has it.
+
+    They are uint16, or float32, metres.
 
     Formats of "compressedDepth" begin with 12 bytes; theirs of floating point hold the inverse
     depth as whole numbers n > 0, depth = a / (n - b), and 0 where there is none.
@@ -62,7 +67,7 @@ def compressed_pixels(data: bytes, image_format: str) -> np.ndarray:
 
 
 def _png_pixels(data: bytes) -> np.ndarray:
-    """Values (H, W), uint16, of a grey PNG of 16 bits."""
+    """Return values (H, W), uint16, of a grey PNG of 16 bits."""
     try:
         image = Image.open(BytesIO(data), formats=("PNG",))
         values = np.asarray(image)
@@ -75,7 +80,7 @@ def _png_pixels(data: bytes) -> np.ndarray:
 
 
 def _is_unsigned(image: Image.Image) -> bool:
-    """Whether Pillow reads numbers of 32 bits as signed ones that are not."""
+    """Return whether Pillow reads numbers of 32 bits as signed ones that are not."""
     if not isinstance(image, TiffImageFile) or image.mode != "I":
         return False
     tags = image.tag_v2
@@ -83,9 +88,9 @@ def _is_unsigned(image: Image.Image) -> bool:
 
 
 def read_image(path: Path, where: str) -> np.ndarray:
-    """The values (H, W) of a .png, .tiff or .npy as they stand there: integers or floating point.
+    """Return the stored values (H, W) of a .png, .tiff or .npy: integers or floating point.
 
-    Palette images give their indices. where: names the file in messages. Raises SessionError for
+    Palette images give their indices. where: names the file in messages. Raise SessionError for
     a file that is missing, broken, or of several channels.
     """
     kind = path.suffix.lower()

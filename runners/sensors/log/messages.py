@@ -1,9 +1,10 @@
-"""What a message of a log holds, whatever its encoding and schema were."""
+"""The content of messages of a log, whatever their encoding and schema were."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,54 +19,70 @@ class UnusableMessage(ChselError):
 
 @dataclass(frozen=True, eq=False)
 class ImageMessage:
-    """A depth or deformation image as it was sent.
+    """A depth or deformation image as it was sent."""
 
-    frame: of the camera's optical centre: x right, y down, z forward. values (H, W): uint16 (units
-    are for the reader to know, usually millimetres) or float32 (usually metres).
-    """
+    noun: ClassVar[str] = "depth images"
 
     frame: str
+    """Frame of the camera's optical centre: x right, y down, z forward."""
+
     values: np.ndarray
+    """(H, W): uint16 (units are for the reader to know, usually mm) or float32 (usually m)."""
 
 
 @dataclass(frozen=True)
 class CameraInfoMessage:
-    """Intrinsics of a camera.
+    """Intrinsics of a camera."""
 
-    distorted: whether lens distortion was left in its images as they were taken.
-    """
+    noun: ClassVar[str] = "camera infos"
 
-    camera: PinholeCamera  # of its images as they were taken: K
+    camera: PinholeCamera
+    """Intrinsics K, of its images as they were taken."""
+
     distorted: bool = False
-    rectified: PinholeCamera | None = None  # of rectified images: P
+    """Whether lens distortion was left in its images as they were taken."""
+
+    rectified: PinholeCamera | None = None
+    """Intrinsics P, of rectified images."""
 
 
 @dataclass(frozen=True, eq=False)
 class TransformMessage:
-    """Pose (4, 4) of a child frame in its parent's; static ones hold for all times.
-
-    child: "" of a message of a pose alone, such as geometry_msgs/PoseStamped.
-    """
+    """A pose of a child frame in its parent's."""
 
     parent: str
+    """Name of the parent frame."""
+
     child: str
+    """Name of the child frame; "" of a pose alone, such as geometry_msgs/PoseStamped."""
+
     parent_from_child: FloatArray
+    """Pose (4, 4), metres."""
+
     static: bool = False
+    """Whether it holds for all times."""
 
 
 @dataclass(frozen=True, eq=False)
 class CloudMessage:
-    """Points (N, 3) in a frame, metres; those without a measurement are not finite."""
+    """Points in a frame."""
+
+    noun: ClassVar[str] = "points"
 
     frame: str
+    """Name of the frame."""
+
     points: FloatArray
+    """(N, 3), metres; those without a measurement are not finite."""
 
 
 @dataclass(frozen=True, eq=False)
 class WrenchMessage:
     """A force and a torque in a frame and about its origin."""
 
-    frame: str
+    noun: ClassVar[str] = "forces"
+
+    frame: str  # name of the frame
     force: FloatArray  # (3,), newtons
     torque: FloatArray  # (3,), newton metres
 
@@ -91,13 +108,16 @@ Decode = Callable[[bytes], Iterator[Decoded]]
 
 @dataclass(frozen=True, eq=False)
 class Received:
-    """One message. stamp: nanoseconds, by the sender's clock; None where it gave none.
-
-    log_time: nanoseconds, by the clock of whoever wrote the log. One message of transforms gives
-    one Received for each.
-    """
+    """One message, or one of the transforms of a message."""
 
     topic: str
+    """Name of its topic."""
+
     log_time: int
+    """Nanoseconds, by the clock of the program that wrote the log."""
+
     stamp: int | None
+    """Nanoseconds, by the sender's clock; None where it gave none."""
+
     content: Content
+    """Decoded content."""

@@ -1,4 +1,4 @@
-"""Which samples of a motion are plausible: jumps, outliers, and publishers that contradict."""
+"""The plausible samples of a motion: jumps, outliers, and publishers that contradict."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 
 Distances = Callable[[IntArray, IntArray], FloatArray]
-"""Of pairs of samples, by their indices (N,) and (N,): metres and radians between them (N, 2)."""
+"""Function of pairs of samples, by indices (N,) and (N,): metres and radians between (N, 2)."""
 
 _NANOSECONDS = 1e9
 _NOISE = np.array([0.02, 0.1])  # m, rad: a pose may be off by this in no time at all
 _STEP = np.array([0.01, 0.05])  # m, rad: shorter ways there and back do not matter
 _BACK = 0.25  # of the way there: a sample is back where it was if it is nearer
 _SLOW = 0.5  # of the way there: the motion before or after an outlier is slower
-_BRISK = 500.0  # steps / s^2: the same again and again at 10 m/s^2 or 50 rad/s^2
+_BRISK = 500.0  # steps / s^2: the same, repeated, at 10 m/s^2 or 50 rad/s^2
 _SUDDEN = 2500.0  # steps / s^2: there and back at 50 m/s^2 or 250 rad/s^2, beyond any arm
 _WINDOW, _OFTEN = 16, 5  # so often there and back in so many samples are two publishers
 _MOST_TRACKS = 8  # that a sample may continue, those of late
@@ -47,7 +47,7 @@ class CheckedMotion:
     disputed: BoolArray  # (N,), left out, as two motions alternate
 
     def remarks(self, name: str, limits: MotionLimits) -> list[str]:
-        """Say what was left out. name: of what moves."""
+        """Return lines on what was left out; name: of what moves."""
         jumps, outliers = int(self.jumps.sum()), int(self.outliers.sum())
         disputed = int(self.disputed.sum())
         many = ", perhaps those of a second publisher" if outliers > _MANY * len(self.kept) else ""
@@ -100,7 +100,7 @@ def check_motion(
 def _reachable(
     times: IntArray, distances: Distances, first: IntArray, second: IntArray, limits: MotionLimits
 ) -> BoolArray:
-    """Whether (N,) the way between samples is possible in the time between them."""
+    """Return whether (N,) the way between samples is possible in the time between them."""
     seconds = np.abs(times[second] - times[first]) / _NANOSECONDS
     reach = seconds[:, None] * np.array([limits.speed, limits.turn]) + _NOISE
     possible: BoolArray = (distances(first, second) <= reach).all(axis=1)
@@ -110,7 +110,7 @@ def _reachable(
 def _there_and_back(
     times: IntArray, distances: Distances, left: IntArray
 ) -> tuple[BoolArray, BoolArray]:
-    """Which of samples `left` (L,) are off the way of their neighbours; and which alternate."""
+    """Return which of samples `left` (L,) are off their neighbours' way; and which alternate."""
     outliers, disputed = np.zeros((2, len(left)), dtype=bool)
     if len(left) < 3:
         return outliers, disputed
@@ -139,7 +139,7 @@ def _there_and_back(
 def _short_visits(
     distances: Distances, left: IntArray, *, steps: FloatArray, seconds: FloatArray, length: int
 ) -> BoolArray:
-    """Which of samples `left` (L,) are among `length` ones at one place, left as suddenly as met.
+    """Return which of samples `left` (L,) are among `length` at one place, left as suddenly as met.
 
     steps, seconds (L - 1,): from each sample to the next one.
     """
@@ -158,7 +158,7 @@ def _short_visits(
 def _is_back(
     distances: Distances, before: IntArray, after: IntArray, steps: FloatArray
 ) -> BoolArray:
-    """Whether (N,) samples are where earlier ones were, by the lengths of the ways between."""
+    """Return whether (N,) samples are where earlier ones were, by the lengths of ways between."""
     back: BoolArray = (distances(before, after) / _STEP).max(axis=1) < _BACK * steps
     return back
 
@@ -166,7 +166,7 @@ def _is_back(
 def _tracks(
     times: IntArray, distances: Distances, left: IntArray, starts: IntArray, limits: MotionLimits
 ) -> IntArray:
-    """Numbers (L,) of the motions that samples `left` (L,) belong to.
+    """Return numbers (L,) of the motions that samples `left` (L,) belong to.
 
     starts: where runs of samples begin that are one motion. A run continues the motion of late that
     can have reached it.

@@ -1,4 +1,4 @@
-"""Which time belongs to which probe, as markers in the log or the rig define it."""
+"""The times of probes, as markers in the log or the rig define them."""
 
 from __future__ import annotations
 
@@ -19,27 +19,32 @@ _Span = tuple[int, int, int | None]  # begin, end, index of the probe, where it 
 
 @dataclass(frozen=True)
 class ProbeWindow:
-    """Times of a probe, nanoseconds, in its clock.
-
-    step: its index. opens, closes: what is sensed from `opens` to before `closes` becomes known
-    with this probe. begin, end: contacts count within, both included.
-    """
+    """Times of a probe, nanoseconds."""
 
     step: int
+    """Index of the probe."""
+
     opens: int
+    """Time from which on measurements become known with this probe."""
+
     begin: int
+    """First time at which contacts count."""
+
     end: int
+    """Last time at which contacts count."""
+
     closes: int
+    """Time before which measurements become known with this probe."""
 
     def holds(self, time: int) -> bool:
-        """Whether a time is between its begin and its end."""
+        """Return whether a time is between its begin and its end."""
         return self.begin <= time <= self.end
 
 
 def marked_windows(
     markers: Iterable[tuple[int, str]], first: int, last: int, warnings: LogWarnings
 ) -> list[ProbeWindow]:
-    """The probes of markers (time, text) in a log from `first` to `last`; there may be none.
+    """Return the probes of markers (time, text) in a log from `first` to `last`, if any.
 
     Texts are "begin N", "begin", "end N", "end", integers (below 0: end) and true or false. A begin
     ends the probe before it, unless it repeats its index. Other texts, and begins and ends that do
@@ -77,9 +82,9 @@ def marked_windows(
 def timed_windows(
     probes: Sequence[ProbeTimes], first: int, last: int, warnings: LogWarnings
 ) -> list[ProbeWindow]:
-    """The probes that a rig names by seconds since the first message.
+    """Return the probes that a rig names by seconds since the first message.
 
-    Raises SettingError unless each begins before its end and after the end of the one before.
+    Raise SettingError unless each begins before its end and after the end of the one before.
     """
     spans: list[_Span] = []
     before = 0.0
@@ -98,12 +103,12 @@ def timed_windows(
 
 
 def whole_log(first: int, last: int) -> list[ProbeWindow]:
-    """All of a log as a single probe."""
+    """Return all of a log as a single probe."""
     return [ProbeWindow(0, first, first, last, last + 1)]
 
 
 def _windows(spans: list[_Span], first: int, last: int, warnings: LogWarnings) -> list[ProbeWindow]:
-    """Windows of spans in order of time; indices that do not rise are counted anew."""
+    """Return windows of spans in order of time; count those whose indices do not rise from 0."""
     if not spans:
         return []
     steps = list(range(len(spans)))

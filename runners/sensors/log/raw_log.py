@@ -28,18 +28,31 @@ _STATIC = "tf_static"  # what a topic of transforms that hold for all times ends
 
 
 class RawLog:
-    """Reads one log, as often as wanted, in memory that does not grow with the log.
+    """A log that is read as often as wanted, in memory that does not grow with the log."""
 
-    files: in their order. size: of all, bytes. topics: the schemas by name. begin, end: first and
-    last log time, nanoseconds, 0 without messages. faults: "topic: reason" of what had to be passed
-    by, with how often, as met so far; reading again does not count it again. Raises SessionError
-    for what is no log.
-    """
+    files: list[Path]
+    """Files in their order."""
+
+    size: int
+    """Size of all files, bytes."""
+
+    topics: dict[str, str]
+    """Schemas by the names of topics."""
+
+    begin: int
+    """First log time, nanoseconds, 0 without messages."""
+
+    end: int
+    """Last log time, nanoseconds, 0 without messages."""
+
+    faults: Counter[str]
+    """How often messages were skipped so far, by "topic: reason"; a second reading adds none."""
 
     def __init__(self, path: str | Path, *, progress: Progress = lambda done, size: None) -> None:
+        """Open a log. Raise SessionError for a path that is none."""
         self.path = Path(path).expanduser()
-        self.faults: Counter[str] = Counter()
-        self.topics: dict[str, str] = {}
+        self.faults = Counter()
+        self.topics = {}
         self.files = log_files(self.path)
         self._parts = [RawFile(file) for file in self.files]
         self.size = sum(part.size for part in self._parts)
@@ -50,15 +63,15 @@ class RawLog:
 
     @property
     def warnings(self) -> list[str]:
-        """What a user should know of how the log is read; all of it once it has been."""
+        """Lines for the user on how the log is read; all of them once it has been."""
         return [f"{part.path.name}: {remark}" for part in self._parts for remark in part.remarks]
 
     def messages(
         self, topics: Collection[str], *, progress: Progress = lambda done, size: None
     ) -> Iterator[Received]:
-        """The messages on topics, in order of log time where the files have an index.
+        """Yield the messages on topics, in order of log time where the files have an index.
 
-        What cannot be read is skipped, and counted in `faults`. Raises SessionError if the log has
+        What cannot be read is skipped, and counted in `faults`. Raise SessionError if the log has
         none of the topics.
         """
         known = frozenset(topics) & self.topics.keys()
@@ -68,14 +81,14 @@ class RawLog:
         return self._received(known, progress)
 
     def listing(self) -> str:
-        """All topics with their schemas, for messages to the user."""
+        """Return all topics with their schemas, for messages to the user."""
         shown = sorted(f"{name} ({schema})" for name, schema in self.topics.items())
         more = [f"{len(shown) - _MOST_LISTED} more"] if len(shown) > _MOST_LISTED else []
         damage = "".join(f" ({fault})" for fault, _ in self.faults.most_common(1))
         return ", ".join(shown[:_MOST_LISTED] + more) or f"no topics{damage}"
 
     def digest(self) -> str:
-        """BLAKE2b (128 bit, hexadecimal) of the file, or of the digests of a folder's files."""
+        """Return BLAKE2b (128 bit, hexadecimal) of the file, or of the digests of a folder."""
         digests = [file_digest(path) for path in self.files]
         if self.path.is_file():
             return digests[0]
@@ -113,7 +126,7 @@ class RawLog:
         progress(self.size, self.size)
 
     def _span(self, part: RawFile, progress: Progress) -> tuple[int, ...]:
-        """First and last log time of a file, which is read through if it has no index."""
+        """Return first and last log time of a file, which is read through if it has no index."""
         span = part.times or ()
         if not part.is_indexed:
             faults: Counter[str] = Counter()
@@ -132,7 +145,7 @@ class RawLog:
 
 
 def _series(spans: list[tuple[int, ...]]) -> list[list[int]]:
-    """Numbers of files by series in which each begins when the one before has ended.
+    """Return numbers of files by series in which each begins when the one before has ended.
 
     So of the successive splits of a recording one is open at a time.
     """
@@ -147,7 +160,7 @@ def _series(spans: list[tuple[int, ...]]) -> list[list[int]]:
 
 
 def log_files(path: Path) -> list[Path]:
-    """The MCAP files of a log, bag_2 before bag_10. Raises SessionError if there are none."""
+    """Return the MCAP files of a log, bag_2 before bag_10. Raise SessionError if there are none."""
     if not path.exists():
         raise SessionError(f"log {path} does not exist; {ACCEPTED}")
     if not path.is_dir():
@@ -170,6 +183,6 @@ def log_files(path: Path) -> list[Path]:
 
 
 def _natural(path: Path) -> list[Any]:
-    """A key by which bag_2 comes before bag_10."""
+    """Return a key by which bag_2 comes before bag_10."""
     parts = re.split(r"(\d+)", path.name)
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]

@@ -50,14 +50,14 @@ _SEPARATOR = "\n" + "=" * 80 + "\n"
 
 
 def full_definition(name: str) -> str:
-    """The definition of a message with those of all that it contains, as ROS 2 writes them."""
+    """Return the definition of a message with those of its parts, as ROS 2 writes them."""
     parts = [DEFINITIONS[name].replace("; ", "\n")]
     parts += [f"MSG: {inner}\n" + DEFINITIONS[inner].replace("; ", "\n") for inner in _nested(name)]
     return _SEPARATOR.join(parts) + "\n"
 
 
 def _nested(name: str) -> list[str]:
-    """The messages that a message is made of, each once, in the order of their use."""
+    """Return the messages that a message is made of, each once, in the order of their use."""
     found: dict[str, None] = {}
     for field in DEFINITIONS[name].split("; "):
         inner = field.split()[0].partition("[")[0]

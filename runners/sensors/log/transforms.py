@@ -1,4 +1,4 @@
-"""Where frames and joints of a robot were over time, from the messages of a log."""
+"""Poses of frames and positions of joints over time, from the messages of a log."""
 
 from __future__ import annotations
 
@@ -31,15 +31,17 @@ class TransformError(SessionError):
 
 
 class TransformTree:
-    """Poses of frames in one another at any time.
+    """Poses of frames in one another at any time."""
 
-    faults: transforms that contradict others, with how often; the ones that came first count.
-    times (T,): of all transforms that move, nanoseconds, ascending.
-    """
+    faults: Counter[str]
+    """How often transforms contradicted others, of which the first count, by text."""
+
+    times: IntArray
+    """Times (T,) of all transforms that move, nanoseconds, ascending."""
 
     def __init__(self) -> None:
-        self.faults: Counter[str] = Counter()
-        self.times: IntArray = np.zeros(0, dtype=np.int64)
+        self.faults = Counter()
+        self.times = np.zeros(0, dtype=np.int64)
         self._edges: dict[str, _Edge] = {}  # by child
 
     @property
@@ -62,7 +64,7 @@ class TransformTree:
             self.faults[f"frame {child} is static in several places"] += 1
 
     def settle(self, clocks: ClockCorrection) -> None:
-        """All transforms were added; their times are those by the clocks."""
+        """Correct the times of all transforms that were added by the clocks."""
         for child, edge in self._edges.items():
             edge.settle(clocks)
             if edge.is_static_and_moves():
@@ -72,7 +74,7 @@ class TransformTree:
     def check_motions(self, world: str, frames: Iterable[str], limits: MotionLimits) -> list[str]:
         """Leave out implausible samples of the transforms between frames and the world.
 
-        Returns what a user should know of them. Raises TransformError as `lookup` does.
+        Return what a user should know of them. Raise TransformError as `lookup` does.
         """
         paths = (self._path(world, frame) for frame in frames)
         children = dict.fromkeys(child for path in paths for part in path for child in part)
@@ -81,16 +83,16 @@ class TransformTree:
         return [remark for some in remarks for remark in some]
 
     def jumps(self, target: str, source: str) -> IntArray:
-        """Times (J,), ascending, until which it is not known how a frame moved from the one before.
+        """Return times (J,), ascending, until which the motion of a frame is not known.
 
-        Raises TransformError as `lookup` does.
+        Raise TransformError as `lookup` does.
         """
         down, up = self._path(target, source)
         times = [self._edges[child].jump_times() for child in (*down, *up)]
         return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *times]))
 
     def sent_once(self, target: str, source: str) -> list[str]:
-        """Transforms between two frames that are not static, and were sent a single time."""
+        """Return transforms between two frames that are not static, and were sent a single time."""
         down, up = self._path(target, source)
         edges = {child: self._edges[child] for child in (*down, *up)}
         return [f"{name} in {edge.parent}" for name, edge in edges.items() if len(edge.times) == 1]
@@ -100,11 +102,11 @@ class TransformTree:
         self.times = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *times]))
 
     def lookup(self, target: str, source: str, stamp_ns: int, *, gap_s: float) -> FloatArray:
-        """target_from_source (4, 4) at a time, nanoseconds.
+        """Return target_from_source (4, 4) at a time, nanoseconds.
 
         Linear in position and along the shorter arc of rotation between samples at most `gap_s`
         seconds apart; before the first and after the last sample, by at most `gap_s`, as they are.
-        Raises TransformError if a frame is unknown, not connected, or not known at that time.
+        Raise TransformError if a frame is unknown, not connected, or not known at that time.
         """
         stamps = np.array([stamp_ns])
         poses, valid = self.lookups(target, source, stamps, gap_s=gap_s)
@@ -128,9 +130,9 @@ class TransformTree:
     def lookups(
         self, target: str, source: str, stamps_ns: IntArray, *, gap_s: float
     ) -> tuple[FloatArray, BoolArray]:
-        """target_from_source (N, 4, 4) at times (N,), and whether (N,) it is known; NaN if not.
+        """Return target_from_source (N, 4, 4) at times (N,), NaN if unknown, and which are known.
 
-        Raises TransformError if a frame is unknown or not connected to the other.
+        Raise TransformError if a frame is unknown or not connected to the other.
         """
         stamps = np.asarray(stamps_ns, dtype=np.int64).reshape(-1)
         down, up = self._path(target, source)
@@ -147,14 +149,14 @@ class TransformTree:
         return poses, valid
 
     def _ancestry(self, frame: str) -> list[str]:
-        """A frame, its parent, and so on to the root of its tree."""
+        """Return a frame, its parent, and so on to the root of its tree."""
         found = [frame]
         while (edge := self._edges.get(found[-1])) is not None:
             found.append(edge.parent)
         return found
 
     def _path(self, target: str, source: str) -> tuple[list[str], list[str]]:
-        """Children of the transforms up from each of the frames to where their ways meet."""
+        """Return the children of the transforms from each frame up to where their ways meet."""
         frames = self.frames
         for name in (target, source):
             if name not in frames and target != source:
@@ -196,7 +198,7 @@ class _Edge:
         """The log's times, stamps and poses (4, 4) by topic."""
 
     def add(self, received: Received, message: TransformMessage) -> bool:
-        """Whether the pose agrees with earlier ones; of static ones the latest holds."""
+        """Add a pose, of static ones the latest; return whether it agrees with earlier ones."""
         pose = message.parent_from_child
         if message.static:
             stamp = received.stamp or received.log_time
@@ -231,7 +233,7 @@ class _Edge:
         self._added.clear()
 
     def is_static_and_moves(self) -> bool:
-        """Whether it is static in one place, and was also sent in another one."""
+        """Return whether it is static in one place, and was also sent in another one."""
         if self._static is None or len(self.times) == 0:
             return False
         return bool((np.abs(self._positions - self._static[1][:3, 3]) > _ELSEWHERE).any())
@@ -265,11 +267,11 @@ class _Edge:
         return remarks
 
     def jump_times(self) -> IntArray:
-        """Times (J,) of samples that the ones before them cannot have reached."""
+        """Return times (J,) of samples that the ones before them cannot have reached."""
         return self.times[self._jumps]
 
     def at(self, stamps: IntArray, gap_s: float) -> tuple[FloatArray, BoolArray]:
-        """Poses (N, 4, 4) at times (N,), and whether (N,) they are known."""
+        """Return poses (N, 4, 4) at times (N,), and whether (N,) they are known."""
         known_at = self.times
         if len(known_at) == 0:
             pose = np.eye(4) if self._static is None else self._static[1]
@@ -290,7 +292,7 @@ class _Edge:
         return compose(rotation_matrices(turned), position), near
 
     def nearest(self, stamp: int) -> float:
-        """Seconds from a time to the nearest sample."""
+        """Return seconds from a time to the nearest sample."""
         away = (self.times - stamp) / _NANOSECONDS
         return float(away[np.argmin(np.abs(away))])
 
@@ -301,22 +303,22 @@ def _listed(names: list[str]) -> str:
 
 
 class JointHistory:
-    """Values of joints by time; a state holds until the next one.
+    """Values of joints by time; a state holds until the next one."""
 
-    faults: values that are not finite, with how often.
-    """
+    faults: Counter[str]
+    """How often values were not finite, by text."""
 
     def __init__(self, names: Sequence[str], sliding: Collection[str] = ()) -> None:
-        """names: of the joints that matter. sliding: those of them that are prismatic."""
+        """Make a history of joints, by their names; sliding: those that are prismatic."""
         self._names, self._sliding = tuple(names), frozenset(sliding)
-        self.faults: Counter[str] = Counter()
+        self.faults = Counter()
         self._added: list[tuple[Received, Joints]] = []
         self._repeated: Received | None = None  # the last message, where it said nothing new
         self._states: list[tuple[int, Joints | None]] = []
         """Times and positions; None: not known."""
 
     def add(self, received: Received, positions: Mapping[str, float]) -> None:
-        """Positions of a message; joints that it does not name stay where they were."""
+        """Add positions of a message; joints that it does not name stay where they were."""
         last = self._added[-1][1] if self._added else {}
         known = {name: positions[name] for name in self._names if name in positions}
         state = last | {name: value for name, value in known.items() if math.isfinite(value)}
@@ -336,7 +338,7 @@ class JointHistory:
             self._repeated = received
 
     def settle(self, clocks: ClockCorrection, limits: MotionLimits) -> list[str]:
-        """All positions were added; their times are those by the clocks.
+        """Correct the times of all positions that were added by the clocks.
 
         States that are not plausible are left out; returns what a user should know of them.
         """
@@ -364,11 +366,11 @@ class JointHistory:
         return found.remarks(f"the hand's joints, on {topics},", limits)
 
     def first(self) -> Joints:
-        """The first state that is known; empty if there is none."""
+        """Return the first state that is known; empty if there is none."""
         return next((state for _, state in self._states if state is not None), {})
 
     def during(self, opens: int, closes: int) -> list[tuple[int, Joints | None]]:
-        """States from a time to before another, with the times from which they hold.
+        """Return states from a time to before another, with the times from which they hold.
 
         The first one holds from `opens` on; of very many, some are left out. None: not known.
         """

@@ -13,7 +13,7 @@ from chsel.events import Logged, Probe
 from chsel.problem.poses import compose
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.log.ros2_definitions import DEFINITIONS, full_definition
-from runners.sessions.sensors import SensorsSession, SensorsSettings
+from runners.sessions.sensors import SensorsSettings, SensorsSource
 from runners.simulated_robot.log_writer import camera_info, header, image, joint_state, transform
 
 SECOND = 10**9
@@ -24,7 +24,7 @@ Sent = tuple[str, str, Any, int]  # topic, type, message, log time
 
 def read(path, rig, diameter=None):
     """The session of a log, its probes, and what was told."""
-    session = SensorsSession(SensorsSettings(rig, str(path)), 0, diameter=diameter)
+    session = SensorsSource(SensorsSettings(rig, str(path)), 0, diameter=diameter)
     events = list(session.probes())
     told = "\n".join(event.text for event in events if isinstance(event, Logged))
     return session, [event for event in events if isinstance(event, Probe)], told

@@ -14,7 +14,7 @@ from chsel.problem.sdf_grid import mesh_sdf
 from replay.mcap.reader import read_recording
 from runners import probe
 from runners.objects.loader import ObjectModel, load_model
-from runners.sessions import open_session
+from runners.sessions import open_source
 from runners.sessions.configurations import FITTED
 from runners.sessions.probing import open_probing
 from runners.sessions.probing_hand import panda_hand
@@ -79,11 +79,11 @@ def test_the_settings_of_free_voxels_hold():
 def test_probes_that_are_laid_out_for_another_size_are_a_warning():
     small = ObjectModel("drill", load_model("drill", 1.0), 1.0, 0.001, "drill")
     with pytest.warns(MeshWarning, match="configuration drill is laid out .* paper's size"):
-        open_session("kinematic", ProbingSettings(), small, 0)
+        open_source("kinematic", ProbingSettings(), small, 0)
     large = ObjectModel("drill", load_model("drill", 2.5), 2.5, 0.001, "drill", of_paper=True)
     with warnings.catch_warnings(action="error"):
-        open_session("kinematic", ProbingSettings(), large, 0)
-        open_session("kinematic", ProbingSettings(configuration=FITTED), small, 0)
+        open_source("kinematic", ProbingSettings(), large, 0)
+        open_source("kinematic", ProbingSettings(configuration=FITTED), small, 0)
 
 
 def test_the_hand_is_the_one_that_is_meant():

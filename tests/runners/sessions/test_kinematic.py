@@ -19,11 +19,11 @@ from runners.sessions.configurations import CONFIGURATIONS, find_configuration
 from runners.sessions.gripper import X_REST
 from runners.sessions.kinematic import KinematicEngine
 from runners.sessions.placement import laid_down, lowest, roll_to_rest
-from runners.sessions.probing import ProbingSession, box_shell, choose_workspace, open_probing
+from runners.sessions.probing import ProbingSource, box_shell, choose_workspace, open_probing
 from runners.sessions.probing_hand import ROTATION, panda_hand
 from runners.sessions.probing_settings import ProbingSettings
 
-Run = tuple[trimesh.Trimesh, ProbingSession, list[Probe]]
+Run = tuple[trimesh.Trimesh, ProbingSource, list[Probe]]
 DEFAULT = ProbingSettings()
 TIP = 0.1123  # m: from the hand's origin to the end of its fingers
 

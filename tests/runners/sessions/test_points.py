@@ -7,7 +7,7 @@ import trimesh
 from chsel.errors import PointsError, PointsWarning, SettingError
 from chsel.problem.sdf_grid import object_grid
 from runners.objects.loader import ObjectModel
-from runners.sessions.points import PointsSession, PointsSettings, read_points
+from runners.sessions.points import PointsSettings, PointsSource, read_points
 
 BOX = ObjectModel("box", trimesh.creation.box((0.03, 0.04, 0.12)), 1.0, 0.001, "box")
 SURFACE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.2, 0.0]])
@@ -28,7 +28,7 @@ def text(folder, content, name="points.csv"):
 def test_a_file_without_steps_is_one_probe(tmp_path):
     free = np.full((4, 3), 0.3)
     path = npz(tmp_path, surface=SURFACE, free=free, world_from_object=np.eye(4))
-    session = PointsSession(PointsSettings(str(path)), BOX)
+    session = PointsSource(PointsSettings(str(path)), BOX)
     (probe,) = session.probes()
     assert (session.count, probe.step, probe.outcome) == (1, 0, "points")
     np.testing.assert_array_equal(probe.new_points.known, SURFACE)
@@ -48,7 +48,7 @@ def test_steps_make_a_sequence_and_all_classes_arrive_at_theirs(tmp_path):
         known_sdf=np.array([0.1, -0.2, 0.0]),
         known_step=np.array([0, 5, 5]),
     )
-    probes = list(PointsSession(PointsSettings(str(path)), BOX).probes())
+    probes = list(PointsSource(PointsSettings(str(path)), BOX).probes())
     assert [probe.step for probe in probes] == [0, 2, 5]
     last = probes[2].new_points
     np.testing.assert_array_equal(last.known, np.concatenate([SURFACE[[0, 2]], SURFACE[1:] + 2.0]))
@@ -64,7 +64,7 @@ def test_a_place_that_is_measured_again_counts_once_also_at_a_later_step(tmp_pat
         surface=np.concatenate([SURFACE, held + 0.001]),
         surface_step=np.array([0, 0, 0, *range(30)]),
     )
-    session = PointsSession(PointsSettings(str(path)), BOX)
+    session = PointsSource(PointsSettings(str(path)), BOX)
     probes = list(session.probes())
     known = np.concatenate([probe.new_points.known for probe in probes])
     np.testing.assert_array_equal(known, SURFACE)
@@ -73,7 +73,7 @@ def test_a_place_that_is_measured_again_counts_once_also_at_a_later_step(tmp_pat
 
 
 def test_points_in_millimetres_are_a_warning_and_those_out_of_reach_an_error(tmp_path):
-    session = PointsSession(PointsSettings(str(npz(tmp_path, surface=[[400.0, 0, 0]]))), BOX)
+    session = PointsSource(PointsSettings(str(npz(tmp_path, surface=[[400.0, 0, 0]]))), BOX)
     assert [warning.code for warning in session.warnings] == ["far_away"]
     with pytest.raises(PointsError, match=r"points.npz: points\[0\] has 1e\+08; accepted: up to"):
         read_points(npz(tmp_path, surface=[[1e8, 0, 0]]))
@@ -179,15 +179,15 @@ def test_files_that_are_not_what_their_suffix_says_are_refused(tmp_path):
 
 def test_workspace_is_that_of_the_points_padded_by_the_diameter(tmp_path):
     path = str(npz(tmp_path, surface=SURFACE, free=SURFACE - 1.0))
-    lower, upper = PointsSession(PointsSettings(path), BOX).workspace.bounds
+    lower, upper = PointsSource(PointsSettings(path), BOX).workspace.bounds
     diameter = object_grid(BOX.mesh).diameter
     assert 0.13 < diameter < 0.133
     np.testing.assert_allclose(lower, -1.0 - diameter)
     np.testing.assert_allclose(upper, np.array([0.1, 0.2, 0.0]) + diameter)
     chosen = PointsSettings(path, workspace=((0, 1), (0, 2), (0, 3)))
-    assert PointsSession(chosen, BOX).workspace.upper == (1, 2, 3)
+    assert PointsSource(chosen, BOX).workspace.upper == (1, 2, 3)
     with pytest.raises(PointsError, match="lower bound below"):
-        PointsSession(PointsSettings(path, workspace=((0, 1), (2, 0), (0, 3))), BOX)
+        PointsSource(PointsSettings(path, workspace=((0, 1), (2, 0), (0, 3))), BOX)
     with pytest.raises(SettingError, match=r"session\.path=FILE"):
         PointsSettings()
     with pytest.raises(SettingError, match=r"\[\[x0, x1\]"):

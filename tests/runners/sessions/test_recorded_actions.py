@@ -14,7 +14,7 @@ from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.probing import open_probing, swept_voxels
 from runners.sessions.probing_hand import ROTATION
 from runners.sessions.probing_settings import ProbingSettings
-from runners.sessions.recorded import RecordedActions, RecordedSession, RecordedSettings
+from runners.sessions.recorded import RecordedActions, RecordedSettings, RecordedSource
 
 REPLAYS = Path(__file__).resolve().parents[2] / "replays"
 GRIDS = [
@@ -25,7 +25,7 @@ GRIDS = [
 
 
 def opened(name):
-    session = RecordedSession(RecordedSettings(path=str(REPLAYS / f"{name}.mcap")))
+    session = RecordedSource(RecordedSettings(path=str(REPLAYS / f"{name}.mcap")))
     return session, list(session.probes())
 
 

@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 from chsel.errors import SessionError, SettingError
 from chsel.events import Logged, Probe, RigDescribed, SensorImage
 from chsel.problem.poses import apply, compose, inverse
-from runners.sensors.first_pass import RECTIFIED
+from runners.sensors.depth_camera import RECTIFIED
 from runners.sensors.pose_file import beside, write_pose
 from runners.sensors.rig import Annotations, CloudRig, ExtraContacts, HandRig, ProbeTimes
-from runners.sessions.sensors import SensorsSession, SensorsSettings
+from runners.sessions.sensors import SensorsSettings, SensorsSource
 from tests.replay.conftest import same_bits
 from tests.runners.sensors.foxglove_log import in_foxgloves_messages
 from tests.runners.sensors.sphere_log import (
@@ -49,7 +49,7 @@ def events(log):
 
 
 def open_log(path, rig=RIG, seed=0, **changes):
-    return SensorsSession(SensorsSettings(rig, str(path), **changes), seed)
+    return SensorsSource(SensorsSettings(rig, str(path), **changes), seed)
 
 
 def probes(events):

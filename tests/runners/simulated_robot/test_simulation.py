@@ -15,7 +15,7 @@ from runners.objects.loader import load_model
 from runners.sensors.log.messages import Received
 from runners.sensors.log.raw_log import RawLog
 from runners.sessions import session_settings
-from runners.sessions.sensors import SensorsSession
+from runners.sessions.sensors import SensorsSource
 from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS, REST, world_from_camera
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
 from runners.simulated_robot.simulation import START, TICK, SimulatedLog, simulate_log
@@ -72,7 +72,7 @@ def test_pushes_end_where_the_pads_feel_the_bottle(log):
 def test_contacts_lie_on_the_object_and_free_space_beside_it(log):
     rig = OmegaConf.to_container(OmegaConf.load(CONF / "session" / "rig" / "cabinet.yaml"))
     rig["cameras"][0]["edge_reach"] = 2  # of fewer pixels than usual
-    session = SensorsSession(session_settings("sensors", {"path": str(log.path), "rig": rig}), 0)
+    session = SensorsSource(session_settings("sensors", {"path": str(log.path), "rig": rig}), 0)
     probes = [event for event in session.probes() if isinstance(event, Probe)]
     assert [len(probe.contacts) for probe in probes] == [50, 50]
 

@@ -1,4 +1,4 @@
-"""Where plausible sets are made for: the problems of a recording, a raw log or a points file."""
+"""The problems of a recording, of a raw log or of a file of points, as plausible sets use them."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from replay.mcap.reader import Recording, read_recording
 from replay.mcap.schemas import PROFILE
 from runners.objects.loader import ObjectConfig, load_object
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
-from runners.sessions import open_session, session_settings
+from runners.sessions import open_source, session_settings
 from runners.sessions.source import ProbeSource
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
-    """What a file holds."""
+class ProblemFile:
+    """The content of a file."""
 
     object: str
     mesh: trimesh.Trimesh
@@ -43,7 +43,7 @@ class Source:
 
 
 class ProbedProblems:
-    """All points up to a step; where a registration starts does not matter here."""
+    """Problems of all points up to a step, wherever a registration starts."""
 
     def __init__(
         self, events: Sequence[Event], of: ProbeSource | SessionStarted, sdf: SdfGrid, seed: int
@@ -53,7 +53,7 @@ class ProbedProblems:
         self.steps = tuple(probe.step for probe in self._probes)
 
     def problem(self, step: int) -> RegistrationProblem:
-        """All that is known at a step."""
+        """Return the problem of all that is known at a step."""
         new = [probe.new_points for probe in self._probes if probe.step <= step]
         return RegistrationProblem(
             self._sdf,
@@ -64,8 +64,8 @@ class ProbedProblems:
             StreamKey(self._seed, step),
         )
 
-    def found(self, step: int) -> None:
-        """Nothing was registered."""
+    def hypotheses(self, step: int) -> None:
+        """Return None, as nothing was registered."""
 
 
 class RecordedProblems:
@@ -74,19 +74,19 @@ class RecordedProblems:
     def __init__(self, recording: Recording) -> None:
         self.problem, self._recording = recording.problem, recording
 
-    def found(self, step: int) -> Hypotheses | None:
-        """What was found at a step, if that was recorded."""
+    def hypotheses(self, step: int) -> Hypotheses | None:
+        """Return the result of a step, if one was recorded."""
         return self._recording.hypotheses(step) if self._recording.has_result(step) else None
 
 
-def open_source(
+def open_problem_file(
     path: Path,
     object_config: Mapping[str, Any],
     session: Mapping[str, Any],
     assets: Path,
     seed: int,
-) -> Source:
-    """A recording; else a raw log or a file of known points, for which the object must be named.
+) -> ProblemFile:
+    """Open a recording; else a raw log or a file of known points, whose object must be named.
 
     session: its settings, for what is not a recording; raw logs need those of kind "sensors", with
     which a .yaml is a depth image.
@@ -107,16 +107,18 @@ def open_source(
         kind, values = "sensors", {**values, "pose": "none", "images": False}
     model = load_object(build_settings(ObjectConfig, object_config, "object"), assets)
     settings = session_settings(kind, {**values, "path": str(path)})
-    opened = open_session(kind, settings, model, seed)
+    opened = open_source(kind, settings, model, seed)
     events, sdf = list(opened.probes()), model.grid(settings)
     problems = ProbedProblems(events, opened, sdf, seed)
     described = [event.source for event in events if isinstance(event, RigDescribed)]
     digest = described[0] if described else file_digest(path)
     truth = opened.world_from_object
-    return Source(model.name, model.mesh, truth, model.epsilon, problems.steps, problems, digest)
+    return ProblemFile(
+        model.name, model.mesh, truth, model.epsilon, problems.steps, problems, digest
+    )
 
 
-def _recorded(path: Path) -> Source:
+def _recorded(path: Path) -> ProblemFile:
     recording = read_recording(path)
     start = recording.start
     epsilon = start.config.get("object", {}).get("epsilon")
@@ -128,11 +130,11 @@ def _recorded(path: Path) -> Source:
     if not steps:
         raise RecordingError(f"recording {path} has no registration problem and no probe")
     truth = start.world_from_object
-    return Source(start.object, start.mesh, truth, epsilon, steps, problems, file_digest(path))
+    return ProblemFile(start.object, start.mesh, truth, epsilon, steps, problems, file_digest(path))
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is a recording, by its name and header; also if that cannot be read."""
+    """Return whether a file is a recording, by its name and header; also if it is unreadable."""
     if path.suffix.lower() != ".mcap":
         return False
     if not path.is_file():
