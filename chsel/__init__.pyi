@@ -17,10 +17,10 @@ from .next_probe.action_lattice import around_actions as around_actions
 from .next_probe.action_lattice import forward_actions as forward_actions
 from .next_probe.action_lattice import straight_actions as straight_actions
 from .next_probe.decision_problem import Actions as Actions
-from .next_probe.decision_problem import Belief as Belief
 from .next_probe.decision_problem import Decision as Decision
 from .next_probe.decision_problem import DecisionProblem as DecisionProblem
 from .next_probe.decision_problem import HandShape as HandShape
+from .next_probe.decision_problem import WeightedPoses as WeightedPoses
 from .numerics.threads import set_threads as set_threads
 from .policies import build_policy as build_policy
 from .problem.mesh import load_mesh as load_mesh

@@ -36,7 +36,7 @@ from runners.objects.scans import AssetsConfig, scan_file
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.sections import short_tables
 from runners.reporting.tables import print_table
-from runners.run.scene import PresetName
+from runners.run.setup import PresetName
 from runners.sessions.faults import CLEAN, LEVELS
 from runners.sessions.probing_settings import without_defaults
 

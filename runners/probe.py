@@ -32,8 +32,8 @@ from runners.command.program import command, plain, require_used
 from runners.run.display import Display, compiling_line
 from runners.run.grasps import Grasps
 from runners.run.recording import make_run_folder, write_in_run_folder
-from runners.run.scene import GRID, ProbeConfig, Scene, open_scene, session_started
 from runners.run.session_run import Row, steps
+from runners.run.setup import GRID, ProbeConfig, RunSetup, open_setup, session_started
 from runners.sessions import kinds_of, source_kind
 from runners.sessions.source import ObjectOrigin
 
@@ -57,23 +57,23 @@ def main(config: DictConfig) -> None:
     method = build_method(method_name, method_config)
     with ExitStack() as stack:
         with Console().status("opening the session"), watched(lambda _: None):
-            scene = open_scene(checked)
-        stack.callback(scene.session.close)
+            setup = open_setup(checked)
+        stack.callback(setup.source.close)
         with compiling_line():
             warm_up(method)
-            if scene.policy is not None:
-                warm_up_policy(scene.policy)
-            if scene.report is not None:  # of sensors
+            if setup.policy is not None:
+                warm_up_policy(setup.policy)
+            if setup.report is not None:  # of sensors
                 warm_up_sensing()
-        folder = make_run_folder(Path(checked.logs) / "probe", scene.object_name, method_name)
+        folder = make_run_folder(Path(checked.logs) / "probe", setup.object_name, method_name)
         write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
-        started = session_started(checked, values, method_name, scene)
+        started = session_started(checked, values, method_name, setup)
         with Interrupt() as interrupt:
             interrupted = run_session(
                 folder,
                 checked,
                 method=method,
-                scene=scene,
+                setup=setup,
                 started=started,
                 grasps=grasps,
                 interrupt=interrupt,
@@ -148,17 +148,17 @@ def run_session(
     config: ProbeConfig,
     *,
     method: Method,
-    scene: Scene,
+    setup: RunSetup,
     started: SessionStarted,
     grasps: Grasps | None,
     interrupt: Interrupt,
     display: Display,
 ) -> bool:
     """Run the session to its end or to Ctrl-C; return whether it was interrupted."""
-    if scene.session.recorded is not None:
+    if setup.source.recorded is not None:
         display.say(f"object: {started.object}")
-    policy = scene.policy
-    display.probes(scene.session.count if policy is None else policy.settings.probes)
+    policy = setup.policy
+    display.probes(setup.source.count if policy is None else policy.settings.probes)
     settings = config.recording
     run = Run(
         method,
@@ -169,17 +169,17 @@ def run_session(
         ),
         policy=policy,
         with_belief=True,
-        opening=scene.warnings,
+        opening=setup.warnings,
         snapshot_interval=settings.snapshot_interval,
         show=lambda *_: interrupt.check(),
     )
-    scene.begin(run, started)
-    display.warn(scene.warnings)
+    setup.begin(run, started)
+    display.warn(setup.warnings)
     rows: list[Row] = []
     outcome = "finished"
     try:
         try:
-            for row in steps(run, scene.session, timings=settings.timings, grasps=grasps):
+            for row in steps(run, setup.source, timings=settings.timings, grasps=grasps):
                 rows.append(row)
                 display.probe(row)
                 display.warn(run.warnings)
@@ -202,9 +202,9 @@ def run_session(
         raise
     finally:
         with _first_error_alone(outcome):
-            _summarise(folder, scene, run=run, rows=rows, outcome=outcome)
-    if scene.report is not None:
-        display.sensed(scene.report)
+            _summarise(folder, setup, run=run, rows=rows, outcome=outcome)
+    if setup.report is not None:
+        display.sensed(setup.report)
     display.table(rows)
     if outcome == "interrupted":
         display.say("interrupted: the recording holds everything up to here")
@@ -225,12 +225,12 @@ def _first_error_alone(outcome: str) -> suppress | nullcontext[None]:
     return suppress(OSError, RecordingError, WritingError)
 
 
-def _summarise(folder: Path, scene: Scene, *, run: Run, rows: list[Row], outcome: str) -> None:
+def _summarise(folder: Path, setup: RunSetup, *, run: Run, rows: list[Row], outcome: str) -> None:
     """Write the outcome, warnings, and the numbers of every step, times included."""
     started = run.started
     trust = run.trust
     recording = folder / "recording.mcap"
-    sensors = scene.report.total().items() if scene.report else ()
+    sensors = setup.report.total().items() if setup.report else ()
     names = ("runner", "object", "session", "method", "seed")
     summary = {
         **{name: getattr(started, name) for name in names},

@@ -39,7 +39,7 @@ from runners.evaluation.experiment import this_command
 from runners.evaluation.trial_configurations import chosen_names, chosen_seeds
 from runners.reporting.tables import Table, print_table, table_of
 from runners.run.display import compiling_line
-from runners.run.scene import PresetName
+from runners.run.setup import PresetName
 from runners.sensors.depth_frame import SUFFIXES as FRAMES
 from runners.sessions.problem_file import open_problem_file
 

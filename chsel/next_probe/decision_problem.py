@@ -146,7 +146,7 @@ class Actions:
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
+class WeightedPoses:
     """K poses that the object may have, and how probable each is."""
 
     object_from_world: FloatArray  # (K, 4, 4)
@@ -179,7 +179,7 @@ class DecisionProblem:
     points: KnownPoints  # all that are known, in the world
     workspace: Workspace  # where the object can be
     free_resolution: float  # side of the voxels of free space, metres
-    belief: Belief  # weighted poses of the object
+    belief: WeightedPoses  # weighted poses of the object
     actions: Actions  # that the session offers
     available: BoolArray  # (A,): which of them can be taken now
     hand: HandShape  # that probes

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.next_probe.decision_problem import Actions, Belief, HandShape
+from chsel.next_probe.decision_problem import Actions, HandShape, WeightedPoses
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import turned, turned_back
@@ -59,7 +59,7 @@ class _View(NamedTuple):
 
 
 def first_contacts(
-    sdf: SdfGrid, belief: Belief, actions: Actions, hand: HandShape
+    sdf: SdfGrid, belief: WeightedPoses, actions: Actions, hand: HandShape
 ) -> FirstContacts:
     """Follow every action in every pose to the first contact of the hand's front.
 

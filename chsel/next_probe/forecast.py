@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from chsel.next_probe.decision_problem import Belief, Decision, DecisionProblem
+from chsel.next_probe.decision_problem import Decision, DecisionProblem, WeightedPoses
 from chsel.next_probe.first_contact import FirstContacts, first_contacts
 from chsel.numerics.arrays import BoolArray, FloatArray, evenly_spaced
 from chsel.numerics.compiler import compiled
@@ -49,13 +49,13 @@ class BeliefSettings(CheckedSettings):
     floor: float | None = 0.0
 
 
-def belief_after(hypotheses: Hypotheses, settings: BeliefSettings) -> Belief:
+def belief_after(hypotheses: Hypotheses, settings: BeliefSettings) -> WeightedPoses:
     """Return the candidates of a registration, else its hypotheses, all with one weight."""
     poses = hypotheses.candidates
     if len(poses) == 0:
         poses = hypotheses.object_from_world[~hypotheses.duplicate]
     poses = poses[evenly_spaced(len(poses), settings.poses)]
-    return Belief(poses, np.full(len(poses), 1.0 / len(poses)))
+    return WeightedPoses(poses, np.full(len(poses), 1.0 / len(poses)))
 
 
 def belief_before(
@@ -64,7 +64,7 @@ def belief_before(
     workspace: Workspace,
     key: StreamKey,
     settings: BeliefSettings,
-) -> Belief:
+) -> WeightedPoses:
     """Return poses with the centre in the workspace, turned any way, that free points allow.
 
     The first of those drawn that free space does not enter by more than its grid's resolution; if
@@ -87,7 +87,7 @@ def belief_before(
         depth[n] = _depths(sdf, poses[n : n + 1], free)[0]
         missing -= depth[n] <= sdf.resolution
     order = np.argsort(depth, kind="stable")[: settings.poses]
-    return Belief(poses.matrices[order], np.full(len(order), 1.0 / len(order)))
+    return WeightedPoses(poses.matrices[order], np.full(len(order), 1.0 / len(order)))
 
 
 def _depths(sdf: SdfGrid, poses: Poses, free: FloatArray) -> FloatArray:

@@ -11,7 +11,13 @@ import numpy as np
 
 from chsel.errors import ChselError, SettingError, quoted, require_instance, require_positive
 from chsel.events import ActionsOffered, Decided, Probe, SessionStarted, Start
-from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
+from chsel.next_probe.decision_problem import (
+    Actions,
+    Decision,
+    DecisionProblem,
+    HandShape,
+    WeightedPoses,
+)
 from chsel.next_probe.forecast import BeliefSettings, belief_after, belief_before, surprise
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.policies.policy import Policy
@@ -268,7 +274,9 @@ class Loop:
             verdict="" if trust is None else trust.verdict,
         )
 
-    def belief(self, settings: BeliefSettings, hypotheses: Hypotheses | None = None) -> Belief:
+    def belief(
+        self, settings: BeliefSettings, hypotheses: Hypotheses | None = None
+    ) -> WeightedPoses:
         """Return the poses that a decision weighs, by a result, by default the last one.
 
         Raise SettingError before any result if the floor is above the workspace.

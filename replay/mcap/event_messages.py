@@ -26,7 +26,13 @@ from chsel.events import (
     SnapshotTaken,
     Start,
 )
-from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
+from chsel.next_probe.decision_problem import (
+    Actions,
+    Decision,
+    DecisionProblem,
+    HandShape,
+    WeightedPoses,
+)
 from chsel.numerics.arrays import digest
 from chsel.problem.mesh import mesh_digest
 from chsel.problem.points import KnownPoints, Workspace
@@ -352,7 +358,7 @@ class RecordedDecision:
             points=points,
             workspace=start.workspace,
             free_resolution=start.free_resolution,
-            belief=Belief(values["poses"], values["weights"]),
+            belief=WeightedPoses(values["poses"], values["weights"]),
             actions=offered.actions,
             available=values["available"],
             hand=offered.hand,

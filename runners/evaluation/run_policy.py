@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from chsel.belief import Gripper, PoseBelief, grasps_work, pose_offsets
-from chsel.next_probe.decision_problem import Belief, Decision
+from chsel.next_probe.decision_problem import Decision, WeightedPoses
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.symmetry import object_symmetry
 from chsel.policies.policy import PolicySettings, StopSettings
@@ -24,8 +24,8 @@ from runners.evaluation.experiment import Row
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.trial_session import StepRecorder, config_values, probe_config
 from runners.run.recording import RecordingConfig
-from runners.run.scene import Scene, open_scene, session_started
 from runners.run.session_run import steps
+from runners.run.setup import RunSetup, open_setup, session_started
 
 _GRASPS = 40  # that a belief is asked about
 _MIDDLES = {"middle_50": 0.25, "middle_90": 0.05}  # of the members: where they begin
@@ -41,38 +41,38 @@ def policy_rows(
     warm_up(method)  # so that no time holds the loading of compiled kernels
     warm_up_policy(policy)
     config, settings = probe_config(plan, trial, contender), policy.settings
-    scene, rows = open_scene(config), list[Row]()
+    setup, rows = open_setup(config), list[Row]()
     try:
-        started = session_started(config, config_values(config), registering.name, scene)
+        started = session_started(config, config_values(config), registering.name, setup)
         run = Run(
             method,
             recorder,
-            policy=scene.policy,
+            policy=setup.policy,
             with_belief=True,
             snapshot_interval=RecordingConfig.snapshot_interval,
         )
-        scene.begin(run, replace(started, runner="evaluate"))
+        setup.begin(run, replace(started, runner="evaluate"))
         about = plan.about(trial, contender.label)
-        for numbers in steps(run, scene.session, catch=Exception):
-            rows.append(about | _row(scene, settings, seed=trial.seed, numbers=numbers, run=run))
+        for numbers in steps(run, setup.source, catch=Exception):
+            rows.append(about | _row(setup, settings, seed=trial.seed, numbers=numbers, run=run))
             if len(rows) >= settings.probes:  # of a session that no policy ends
                 break
     finally:
-        scene.session.close()
+        setup.source.close()
     return rows
 
 
 def _row(
-    scene: Scene, settings: PolicySettings, *, seed: int, numbers: Row, run: Run
+    setup: RunSetup, settings: PolicySettings, *, seed: int, numbers: Row, run: Run
 ) -> dict[str, Any]:
     """Return what is known after a step. numbers: the step's row by `steps`."""
-    true_pose = scene.session.world_from_object
+    true_pose = setup.source.world_from_object
     assert true_pose is not None
     truth = Poses.of(inverse(true_pose[None]))
 
     def errors(poses: FloatArray) -> FloatArray:
         """Return how far the surface in poses (B, 4, 4), object_from_world, is off (B,), metres."""
-        return surface.outline_distances_to(scene.sdf, Poses.of(poses), truth)
+        return surface.outline_distances_to(setup.sdf, Poses.of(poses), truth)
 
     after = run.loop.state.decided
     found = run.loop.state.previous
@@ -88,7 +88,7 @@ def _row(
         "poses": len(belief),
         "belief_error": float(error),
         "error": float(error),
-        "spread": spread_of(scene.sdf, belief),
+        "spread": spread_of(setup.sdf, belief),
         "action": numbers.get("action"),
         "hit_forecast": numbers.get("hit_chance"),
         "forecast_spread": numbers.get("expected_spread"),
@@ -108,14 +108,14 @@ def _row(
         if hypotheses.trust is not None and run.belief is not None:
             row |= belief_numbers(
                 run.belief,
-                scene.mesh,
-                sdf=scene.sdf,
+                setup.mesh,
+                sdf=setup.sdf,
                 world_from_object=true_pose,
                 key=StreamKey(seed, run.step),
             )
     trust = None if found is None else found.trust
     verdict = "" if trust is None else trust.verdict
-    diameter = scene.sdf.diameter
+    diameter = setup.sdf.diameter
     if after is None:
         stop = usual_stop(row["spread"], None, diameter=diameter, verdict=verdict)
         return row | {"stop": stop}
@@ -164,7 +164,7 @@ def belief_numbers(
     return row | {"grasp_chance": float(chance[best]), "grasp_works": bool(works[0, 0])}
 
 
-def spread_of(sdf: SdfGrid, belief: Belief) -> float:
+def spread_of(sdf: SdfGrid, belief: WeightedPoses) -> float:
     """Return the spread of a belief, metres, as decisions have it."""
     poses = Poses.of(belief.object_from_world)
     return surface.surface_spread(surface.outline_distances(sdf, poses), belief.weights)

@@ -26,12 +26,12 @@ from runners.evaluation.trial_configurations import SENSORS
 from runners.evaluation.true_poses import ensure_log, guessed_pose, simulated_truth, sought_pose
 from runners.objects.scans import AssetsConfig
 from runners.run.recording import RecordingConfig
-from runners.run.scene import (
+from runners.run.setup import (
     GRID,
     GraspConfig,
     PresetName,
     ProbeConfig,
-    open_scene,
+    open_setup,
     session_started,
 )
 from runners.sessions.problem_file import ProbedProblems
@@ -114,20 +114,20 @@ def record_session(plan: Plan, trial: Trial, recorder: Recorder) -> None:
     """Probe, or read the trial's raw log, and write it all down; of a log with its true pose."""
     log = ensure_log(plan, trial) if plan.kind == SENSORS else None
     config = probe_config(plan, trial)
-    scene, values = open_scene(config), config_values(config)
-    session, values["session"] = scene.session, dict(values["session"])
+    setup, values = open_setup(config), config_values(config)
+    session, values["session"] = setup.source, dict(values["session"])
     values.pop("method")
     try:
-        for warning in scene.warnings:
+        for warning in setup.warnings:
             warnings.warn(warning, stacklevel=2)
         truth, events = session.world_from_object, list(session.probes())
         if log is not None:  # found with what is known at the end
-            found = ProbedProblems(events, session, scene.sdf, trial.seed)
+            found = ProbedProblems(events, session, setup.sdf, trial.seed)
             at_end = found.problem(max(found.steps, default=0))
             guess, known = guessed_pose(log), simulated_truth(log)
-            truth, values[TRUTH] = sought_pose(at_end, scene.mesh, guess, plan.truth, known)
+            truth, values[TRUTH] = sought_pose(at_end, setup.mesh, guess, plan.truth, known)
             values["session"] |= {"path": f"{trial.configuration}/{log.name}"}
-        started = session_started(config, values, "none", scene)
+        started = session_started(config, values, "none", setup)
         recorder.record(replace(started, runner="evaluate", world_from_object=truth, start=None))
         for event in events:
             recorder.record(event)

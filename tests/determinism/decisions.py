@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from chsel.next_probe.decision_problem import Actions, Belief, DecisionProblem, HandShape
+from chsel.next_probe.decision_problem import Actions, DecisionProblem, HandShape, WeightedPoses
 from chsel.next_probe.forecast import BeliefSettings, Forecast, belief_before, surprise
 from chsel.policies import OURS, build_policy
 from chsel.problem.poses import axis_angle, compose, inverse, product, random_rotations
@@ -80,4 +80,4 @@ def _scattered(workspace):
     turns = product(few, random_rotations(stream, 1))
     poses = inverse(compose(turns, middle + 0.02 * normals(stream, (_POSES, 3))))
     weights = np.arange(_POSES) % 4 / 1.0
-    return Belief(poses, weights / float(int(weights.sum())))
+    return WeightedPoses(poses, weights / float(int(weights.sum())))

@@ -25,7 +25,13 @@ from chsel.events import (
     Timed,
     Traced,
 )
-from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
+from chsel.next_probe.decision_problem import (
+    Actions,
+    Decision,
+    DecisionProblem,
+    HandShape,
+    WeightedPoses,
+)
 from chsel.numerics.arrays import digest
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import compose, random_rotations
@@ -133,7 +139,7 @@ def with_decisions(events):
     made: list[Event] = [start, *events[1:starting], ActionsOffered(-1, offered, hand)]
 
     def decided(*, stop=""):
-        belief = Belief(_poses(random, poses), np.full(poses, 1.0 / poses))
+        belief = WeightedPoses(_poses(random, poses), np.full(poses, 1.0 / poses))
         available = np.arange(actions) != probed
         chosen = -1 if stop else (probed + 1) % actions
         contacts = random.normal(size=(poses, 3))

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import trimesh
 
-from chsel.next_probe.decision_problem import Actions, Belief, DecisionProblem, HandShape
+from chsel.next_probe.decision_problem import Actions, DecisionProblem, HandShape, WeightedPoses
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import compose
 from chsel.problem.streams import StreamKey
@@ -53,7 +53,7 @@ def ball_problem(poses, actions, *, weights=None, available=None, points=None, s
         points=points or KnownPoints(),
         workspace=WORKSPACE,
         free_resolution=0.01,
-        belief=Belief(poses, weights),
+        belief=WeightedPoses(poses, weights),
         actions=actions,
         available=available,
         hand=box_hand(),

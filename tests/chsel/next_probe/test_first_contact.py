@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from chsel.next_probe.decision_problem import CELL, Actions, Belief, HandShape
+from chsel.next_probe.decision_problem import CELL, Actions, HandShape, WeightedPoses
 from chsel.next_probe.first_contact import first_contacts, touched_points
 from chsel.problem.poses import apply, compose, inverse, random_rotations
 from chsel.problem.sdf_grid import SdfGrid
@@ -41,7 +41,7 @@ def test_first_contacts_are_those_of_the_meshes(name):
     starts = middle + np.einsum("aij,aj->ai", turns[:, :, :2], beside) - 0.6 * turns[:, :, 2]
     actions = Actions(compose(turns, starts), np.full(12, _WAY))
     sdf = SdfGrid.from_mesh(mesh, 0.01)
-    belief = Belief(inverse(world_from_object[None]), np.ones(1))
+    belief = WeightedPoses(inverse(world_from_object[None]), np.ones(1))
     hand = panda_hand()
     forecast = first_contacts(sdf, belief, actions, hand.shape)
     engine = KinematicEngine(mesh, world_from_object, ProbingSettings(), hand)
@@ -63,7 +63,9 @@ def test_a_flat_hand_meets_a_ball_at_its_nearest_point(ahead):
     centre, ahead = np.array([0.2, -0.1, 0.3]), np.array(ahead)
     starts = [centre - distance * ahead for distance in (0.3, 0.07, 0.02, 0.6, -0.3)]
     actions = Actions(np.array([facing(start, ahead) for start in starts]), np.full(5, 0.5))
-    found = first_contacts(ball(), Belief(at(tuple(centre)), np.ones(1)), actions, box_hand())
+    found = first_contacts(
+        ball(), WeightedPoses(at(tuple(centre)), np.ones(1)), actions, box_hand()
+    )
     ways = np.array([0.3, 0.07, 0.02, np.inf, -0.3]) - RADIUS  # the fourth ends too early
     assert found.travel[0] == pytest.approx(ways, abs=1e-3)
     met = np.isfinite(ways)
@@ -135,7 +137,7 @@ def test_first_contacts_are_those_of_the_definition(hand):
     beside = stream.uniform(-0.03, 0.03, (200, 2))
     starts = middle + np.einsum("aij,aj->ai", turns[:, :, :2], beside) - 0.4 * turns[:, :, 2]
     actions = Actions(compose(turns, starts), np.full(200, _WAY))
-    found = first_contacts(sdf, Belief(pose[None], np.ones(1)), actions, hand)
+    found = first_contacts(sdf, WeightedPoses(pose[None], np.ones(1)), actions, hand)
     assert np.isfinite(found.travel).sum() >= 100
     for n, world_from_hand in enumerate(actions.world_from_hand):
         way, place = by_definition(sdf, pose, world_from_hand, hand)
@@ -146,11 +148,11 @@ def test_first_contacts_are_those_of_the_definition(hand):
 def test_threads_and_other_actions_change_no_bit(threads):
     stream = np.random.default_rng(6)
     poses = at(*stream.uniform(-0.1, 0.1, (60, 3)).tolist())
-    belief = Belief(poses, np.full(60, 1.0 / 60.0))
+    belief = WeightedPoses(poses, np.full(60, 1.0 / 60.0))
     actions = along_x(stream.uniform(-0.1, 0.1, (9, 2)).tolist())
     found = first_contacts(ball(), belief, actions, box_hand())
     some = Actions(actions.world_from_hand[[7, 2]], actions.length[[7, 2]])
-    few = first_contacts(ball(), Belief(poses[5:7], np.full(2, 0.5)), some, box_hand())
+    few = first_contacts(ball(), WeightedPoses(poses[5:7], np.full(2, 0.5)), some, box_hand())
     assert np.array_equal(few.travel, found.travel[5:7][:, [7, 2]])
     assert np.array_equal(few.contact, found.contact[5:7][:, [7, 2]])
     torch.set_num_threads(1)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from chsel.errors import PoseError, SettingError
-from chsel.next_probe.decision_problem import Belief, HandShape
+from chsel.next_probe.decision_problem import HandShape, WeightedPoses
 from chsel.next_probe.forecast import (
     BeliefSettings,
     Forecast,
@@ -130,19 +130,35 @@ def test_a_start_behind_the_object_is_blocked():
 @pytest.mark.parametrize("name", POLICIES)
 def test_one_pose_or_one_action_is_decided(name):
     problem = some_problem(1, 20, 0.1)
-    sure = replace(problem, belief=Belief(at((0.0, 0.0, 0.0)), np.ones(1)))
+    sure = replace(problem, belief=WeightedPoses(at((0.0, 0.0, 0.0)), np.ones(1)))
     assert build_policy(name).decide(sure).stop == "spread"
     single = ball_problem(problem.belief.object_from_world, along_x([(0.0, 0.0)]))
     decision = build_policy(name).decide(single)
     assert (decision.chosen, decision.stop) == (0, "")
 
 
+def weighted(poses, weight):
+    return WeightedPoses(poses, np.array([weight]))
+
+
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: Belief(at((1e300, 0.0, 0.0)), np.ones(1)), PoseError, "belief[0] is beyond 1e+06"),
-        (lambda: Belief(2.0 * at((0.0, 0.0, 0.0)), np.ones(1)), PoseError, "not a rigid transform"),
-        (lambda: Belief(at((0.0, 0.0, 0.0)), np.array([0.9])), SettingError, "a distribution"),
+        (
+            lambda: WeightedPoses(at((1e300, 0.0, 0.0)), np.ones(1)),
+            PoseError,
+            "belief[0] is beyond 1e+06",
+        ),
+        (
+            lambda: WeightedPoses(2.0 * at((0.0, 0.0, 0.0)), np.ones(1)),
+            PoseError,
+            "not a rigid transform",
+        ),
+        (
+            lambda: WeightedPoses(at((0.0, 0.0, 0.0)), np.array([0.9])),
+            SettingError,
+            "a distribution",
+        ),
         (lambda: along_x([(0.0, 0.0)], length=0.0), SettingError, "length of actions has 0.0"),
         (lambda: HandShape(np.eye(3) * 50.0, [[0, 1, 2]]), SettingError, "the hand reaches 50 m"),
     ],

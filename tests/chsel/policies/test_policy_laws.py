@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from chsel.next_probe.decision_problem import STOPS, Actions, Belief
+from chsel.next_probe.decision_problem import STOPS, Actions, WeightedPoses
 from chsel.policies import build_policy
 from chsel.problem.poses import apply, compose, inverse
 from tests.chsel.laws import every_policy
@@ -95,7 +95,7 @@ def test_a_decision_turns_with_the_world_about_the_vertical(name):
     turn = compose(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
     usual, before = decided(name, problem()), problem()
     actions = Actions(turn @ before.actions.world_from_hand, before.actions.length)
-    belief = Belief(before.belief.object_from_world @ inverse(turn), before.belief.weights)
+    belief = WeightedPoses(before.belief.object_from_world @ inverse(turn), before.belief.weights)
     found = decided(name, replace(before, actions=actions, belief=belief))
     assert found.chosen == usual.chosen
     np.testing.assert_allclose(found.score, usual.score, rtol=1e-9, atol=1e-12)
@@ -117,7 +117,7 @@ def test_the_budget_a_narrow_belief_and_blocked_starts_end_a_session(name):
     budget = build_policy(name, {"probes": 4})
     assert budget.decide(problem(step=3)).stop == ""
     assert budget.decide(problem(step=4)).stop == "budget"
-    narrow = replace(problem(), belief=Belief(at((0.0, 0.0, 0.0)), np.ones(1)))
+    narrow = replace(problem(), belief=WeightedPoses(at((0.0, 0.0, 0.0)), np.ones(1)))
     assert decided(name, narrow).stop == "spread"
     within = [facing((0.0, -0.04, 0.01), (1.0, 0.0, 0.0))]  # a start inside of the first ball
     blocked = decided(name, problem(Actions(np.array(within), np.array([0.5]))))

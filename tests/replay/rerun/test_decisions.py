@@ -7,7 +7,13 @@ import pytest
 import trimesh
 
 from chsel.events import ActionsOffered, Decided, Probe, SessionEnded
-from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
+from chsel.next_probe.decision_problem import (
+    Actions,
+    Decision,
+    DecisionProblem,
+    HandShape,
+    WeightedPoses,
+)
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import compose
 from chsel.problem.streams import StreamKey
@@ -30,7 +36,7 @@ def decided(step, chosen, score, stop=""):
         points=KnownPoints(),
         workspace=WORKSPACE,
         free_resolution=0.01,
-        belief=Belief(np.eye(4)[None], np.ones(1)),
+        belief=WeightedPoses(np.eye(4)[None], np.ones(1)),
         actions=ACTIONS,
         available=np.isfinite(score),
         hand=HAND,

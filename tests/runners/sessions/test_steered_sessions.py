@@ -7,7 +7,7 @@ import pytest
 
 from chsel.errors import SessionError
 from chsel.next_probe.action_lattice import ActionSettings
-from chsel.next_probe.decision_problem import Belief
+from chsel.next_probe.decision_problem import WeightedPoses
 from chsel.next_probe.first_contact import first_contacts
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
@@ -35,7 +35,7 @@ def test_a_probe_goes_straight_along_the_hand_and_meets_what_is_forecast(session
     chosen = np.linspace(0, len(actions) - 1, 9).astype(int).tolist()
     taken = [(action, next(session.take(step, action))) for step, action in enumerate(chosen)]
     object_from_world = inverse(session.world_from_object)
-    belief = Belief(object_from_world[None], np.ones(1))
+    belief = WeightedPoses(object_from_world[None], np.ones(1))
     sdf = SdfGrid.from_mesh(mesh, 0.005, padding=0.02)
     first = first_contacts(sdf, belief, actions, session.hand)
     agreed, late, off = 0, [], []

@@ -1,4 +1,4 @@
-"""What `runners.probe` is asked for, and the session and object that follow from it."""
+"""The configuration of `runners.probe`, and the source and object that follow from it."""
 
 from __future__ import annotations
 
@@ -67,10 +67,10 @@ class ProbeConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
-    """The session and the object that it hides."""
+class RunSetup:
+    """The source of probes of a run, the object that it hides, and what chooses probes."""
 
-    session: ProbeSource
+    source: ProbeSource
     object_name: str
     mesh: trimesh.Trimesh
     sdf: SdfGrid
@@ -84,23 +84,23 @@ class Scene:
     @property
     def report(self) -> Report | None:
         """What became of sensors' images, once they are read."""
-        return self.session.report
+        return self.source.report
 
     @property
     def moves(self) -> float:
         """Metres that a probe moves the object at most."""
-        return self.session.push_distance
+        return self.source.push_distance
 
     def begin(self, run: Run, started: SessionStarted) -> None:
         """Open the recording of a run over the session, and offer the actions."""
         run.begin(started)
         if self.actions is not None:
-            assert isinstance(self.session, Steerable)
-            run.offer(self.actions, self.session.hand)
+            assert isinstance(self.source, Steerable)
+            run.offer(self.actions, self.source.hand)
         run.flush()
 
 
-def open_scene(config: ProbeConfig) -> Scene:
+def open_setup(config: ProbeConfig) -> RunSetup:
     """Open the session with its object; a recorded session brings its own.
 
     Raises SessionError for a policy on a session whose probes cannot be chosen.
@@ -116,7 +116,7 @@ def open_scene(config: ProbeConfig) -> Scene:
     if kind.object is ObjectOrigin.RECORDED:
         source = open_source(kind_name, settings, None, config.seed)
         assert source.recorded is not None
-        scene = Scene(
+        setup = RunSetup(
             source,
             object_name=source.recorded.object,
             mesh=source.recorded.mesh,
@@ -132,7 +132,7 @@ def open_scene(config: ProbeConfig) -> Scene:
         found += source.warnings
         if kind.object is ObjectOrigin.REAL:
             found += check_size(model, source.workspace)
-        scene = Scene(
+        setup = RunSetup(
             source,
             object_name=model.name,
             mesh=model.mesh,
@@ -142,14 +142,14 @@ def open_scene(config: ProbeConfig) -> Scene:
             warnings=tuple(found),
         )
     if policy_name == GRID:
-        return scene
+        return setup
     if not isinstance(source, Steerable):
         raise SessionError(
             f"session {kind_name} cannot be steered, as its probes are given; accepted: "
             "policy=grid, or a session that takes probes as they are chosen, such as kinematic"
         )
     actions = source.offer(policy.settings.actions)
-    return replace(scene, start=FIRST_CONTACT, policy=policy, actions=actions)
+    return replace(setup, start=FIRST_CONTACT, policy=policy, actions=actions)
 
 
 @contextmanager
@@ -167,38 +167,38 @@ def _caught() -> Iterator[list[InputWarning]]:
 
 
 def session_started(
-    config: ProbeConfig, values: Mapping[str, Any], method_name: str, scene: Scene
+    config: ProbeConfig, values: Mapping[str, Any], method_name: str, setup: RunSetup
 ) -> SessionStarted:
     """Return the first event of the recording."""
-    session = scene.session
+    source = setup.source
     recorded = {key: value for key, value in values.items() if key not in _NOT_OF_THE_RESULT}
     used = {
-        "free_resolution": session.free_resolution,
-        "object_resolution": scene.object_resolution,
+        "free_resolution": source.free_resolution,
+        "object_resolution": setup.object_resolution,
     }
     # Numbers that settings leave to the object, so that a recording has them.
     recorded["session"] = {
         key: used.get(key) if value is None else value
         for key, value in without_defaults(values["session"]).items()
     }
-    if scene.policy is None:
+    if setup.policy is None:
         recorded.pop("policy", None)
     if config.grasp.path is None:
         recorded.pop("grasp", None)
     return SessionStarted(
         runner="probe",
-        object=scene.object_name,
+        object=setup.object_name,
         session=str(config.session["kind"]),
         method=method_name,
         seed=config.seed,
         config=recorded,
-        mesh=scene.mesh,
-        sdf=scene.sdf,
-        workspace=session.workspace,
-        free_resolution=session.free_resolution,
-        initial_points=session.initial_points,
-        world_from_object=session.world_from_object,
+        mesh=setup.mesh,
+        sdf=setup.sdf,
+        workspace=source.workspace,
+        free_resolution=source.free_resolution,
+        initial_points=source.initial_points,
+        world_from_object=source.world_from_object,
         environment=environment(),
-        start=scene.start,
-        moves=scene.moves,
+        start=setup.start,
+        moves=setup.moves,
     )
