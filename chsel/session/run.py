@@ -1,4 +1,4 @@
-"""A loop whose events are recorded, with what is said about its points and results."""
+"""A loop whose events are recorded, with warnings about its points and results."""
 
 from __future__ import annotations
 
@@ -62,28 +62,28 @@ class Run:
     """Whether the recording is open, and `started` and `loop` are there."""
 
     started: SessionStarted
-    """How it began."""
+    """The first event: object, workspace, settings."""
 
     loop: Loop
-    """Where it stands."""
+    """The loop, with its state."""
 
     warnings: list[StepWarning]
-    """So far, each kind once."""
+    """All so far, each kind once."""
 
     registered: Registered | None
-    """Of the step, None without a registration."""
+    """The registration of the step, None without one."""
 
     problem: RegistrationProblem | None
-    """Of the step, None without a registration."""
+    """The problem that was registered at the step, None without one."""
 
     answer: Hypotheses | None
     """The last result, with trust; None before the first."""
 
     trust: Trust | None
-    """In the last result that has a pose."""
+    """Trust in the last result that has a pose."""
 
     belief: PoseBelief | None
-    """What the last result with a pose says, where beliefs are wanted; modes keep their numbers."""
+    """After the last result that has a pose, where beliefs are wanted; modes keep their numbers."""
 
     failure: str
     """Why the last step has no result, "" if nothing failed."""
@@ -98,7 +98,7 @@ class Run:
     """The chance that it works."""
 
     seconds: dict[str, float]
-    """Wall-clock times of the step, by stage."""
+    """Wall-clock seconds of the step, by stage."""
 
     def __init__(
         self,

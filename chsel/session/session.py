@@ -274,10 +274,12 @@ class Session:
     def belief(self) -> PoseBelief:
         """Belief about the object after the last result; modes keep their numbers.
 
-        Raises PoseError before there is a result with a pose.
+        Raises PoseError before there is a result, and where the last one has no pose.
         """
-        if self._run.belief is None:
-            raise PoseError("no pose is registered yet; accepted: a belief after `register`")
+        if self._run.answer is None:
+            raise PoseError("nothing is registered yet; accepted: a belief after `register`")
+        if self._run.answer.trust is None or self._run.belief is None:
+            raise PoseError("the last result has no pose; accepted: a belief after one that has")
         return self._run.belief
 
     @_locked
