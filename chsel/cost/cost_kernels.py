@@ -100,8 +100,8 @@ def _twelve(lanes, at):
 def evaluate(model, work, first, count, most_slack):
     """Fill sums with the costs of the poses of the first `count` lanes, and their gradients.
 
-    Infinite costs for poses that are not finite. first: which of those that are remembered they
-    are. most_slack: see free_sums.
+    Costs of poses that are not finite are infinite. first: index of the first of these poses among
+    those remembered. most_slack: see free_sums.
     """
     lanes, near = work.lanes, work.near
     for row in range(12):
@@ -125,7 +125,7 @@ def evaluate(model, work, first, count, most_slack):
 
 @leaf
 def forget(work):
-    """Make the next evaluation gather its neighbours anew."""
+    """Make the next evaluation gather its neighbours."""
     work.near.slack[:] = -1.0
 
 

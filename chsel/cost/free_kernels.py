@@ -66,7 +66,7 @@ class Neighbours(NamedTuple):
     """The points that can matter while poses move little (after Verlet, 1967); see remember."""
 
     points: NearPoints  # gathered
-    slack: FloatArray  # (P,) metres that the object may move until they are gathered anew, or -1
+    slack: FloatArray  # (P,) metres that the object may move until they are stale, or -1
     gathered: FloatArray  # (P, 12) where the object was when they were gathered
     last: FloatArray  # (P, 12) where it was at the last evaluation
     block: FloatArray  # (_SIZE,) numbers of the points that are looked up

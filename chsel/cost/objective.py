@@ -32,7 +32,7 @@ EPSILON = 1e-8
 def costs_of(model, space, vectors, costs, work):
     """Fill the costs (B,) of search vectors (B, d), infinite if one is not finite.
 
-    In kernels alone; see who implements it for a model.
+    Kernels alone call it; `implements` has one for each model.
     """
     raise NotImplementedError
 

@@ -408,7 +408,7 @@ def class_field(sdf: SdfGrid, kernel: Kernel, band: float, name: str) -> ClassFi
 def cloud_norm(points: FloatArray, kernel: Kernel, lattice: float) -> float:
     """Return <f, f> of a cloud (N, 3): the sum over all pairs.
 
-    Of many points on a lattice of that spacing, metres, over a grid, unless that is too large.
+    Many points on a lattice of that spacing, metres, are summed by a grid, unless it is too large.
     """
     reach, nodes = kernel.reach(lattice), _nodes_of(points, lattice)
     if nodes is None or math.prod((nodes.max(axis=0) + 1.0 + 2.0 * reach).tolist()) > MOST_NODES:

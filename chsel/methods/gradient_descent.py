@@ -29,7 +29,7 @@ MOST_ITERATIONS = 1_000_000
 class DescentSettings(CheckedSettings):
     """Adam on all starts at once."""
 
-    # Blocks; Adam starts anew in each, rotations are made orthonormal again.
+    # Blocks; Adam restarts in each, and rotations are made orthonormal.
     restarts: Annotated[int, not_negative, at_most(MOST_ITERATIONS)] = 10
     iterations: Annotated[int, positive, at_most(MOST_ITERATIONS)] = 50  # of a block
     rate: Annotated[float, positive] = 0.01  # Adam's step size

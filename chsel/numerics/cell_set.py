@@ -68,10 +68,10 @@ def cell_set_of(box: Box, cells: BoolArray) -> CellSet:
 def squared_clearances(inside: BoolArray, out: IntArray, gap: int) -> None:
     """Fill out (nx, ny, nz) with squared distances of voxels to the nearest that is not inside.
 
-    In half sides of a voxel: the least over all voxels w that are not inside of the sum over the
-    axes of max(2 |v - w| - gap, 0)^2, computed axis by axis (Felzenszwalb and Huttenlocher, 2012).
-    gap: 1 for the distance from the centre of v to the cube w, 2 for that between cubes. If all are
-    inside, no distance is less than 2^60.
+    Distances are in half sides of a voxel: the least over all voxels w that are not inside of the
+    sum over the axes of max(2 |v - w| - gap, 0)^2, computed axis by axis (Felzenszwalb and
+    Huttenlocher, 2012). gap: 1 for the distance from the centre of v to the cube w, 2 for that
+    between cubes. If all are inside, no distance is less than 2^60.
     """
     flat, flags = out.reshape(-1), inside.reshape(-1)
     for n in range(len(flat)):

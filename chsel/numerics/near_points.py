@@ -356,7 +356,7 @@ def select(tree, cells, to_cell, rounding, near, n):
 def _locate_points(x, y, z, packets, move, cells, rounding, where):
     """Fill the cells of the points of packets; vectorised.
 
-    That of a step of 0 where rounding may put a point in another, that of 255 where x is NaN.
+    It is one with a step of 0 where rounding may put a point in another, and of 255 where x is NaN.
     """
     box = cells.box
     unsure, nothing = np.int32(len(cells.steps) - 2), np.int32(len(cells.steps) - 1)

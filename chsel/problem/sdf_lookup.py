@@ -130,9 +130,9 @@ def distance_with_gradient(field, pose, x, y, z):
 
 @leaf
 def cell_of(box, a, b, c):
-    """Return the arguments of `value_between_nodes`; and whether a point is beyond the box.
+    """Return the arguments of `value_between_nodes`, and whether a point is beyond the box.
 
-    Of the nearest point of the box, then.
+    The arguments are those of the nearest point of the box then.
     """
     first, last, most, inverse = box.first, box.last, box.most, box.inverse
     d = min(max(first[0], a), last[0])

@@ -71,7 +71,7 @@ def strategy_around(
 
 @inner
 def reset(strategy: Strategy) -> None:
-    """Start again around the mean."""
+    """Restart around the mean."""
     n = len(strategy.mean)
     for i in range(n):
         strategy.path_c[i] = strategy.path_s[i] = 0.0
