@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+from distributed import get_client
 
 from chsel.errors import ChselError, SettingError
 from chsel.methods.icp import Icp
@@ -143,9 +144,15 @@ def _dies(plan, task):
     mark = plan.folder / "tried"
     if task.label == "always" or (task.label == "once" and not mark.exists()):
         mark.touch()
-        time.sleep(1.0)  # Dask does not replace a worker that dies before it is known to have begun
+        # Dask does not replace a worker that dies before its nanny knows that it has begun.
+        while set(get_client().run(_status, nanny=True).values()) != {"running"}:
+            time.sleep(0.05)
         os.kill(os.getpid(), signal.SIGKILL)
     tasks.do_task(plan, task)
+
+
+def _status(dask_worker):
+    return dask_worker.status.name
 
 
 def test_a_worker_that_dies_once_costs_nothing_and_twice_its_task_alone(
