@@ -64,7 +64,7 @@ class RayImage(NamedTuple):
 
 
 class FreeGrid:
-    """Which voxels of a workspace are known to be free, and which of them became free last.
+    """The voxels of a workspace that are known to be free, and those that became free last.
 
     The centre of the first voxel is the workspace's lower corner, and the last voxels are those
     nearest to its upper corner. What lies outside of all voxels is ignored, and so are rays and
@@ -77,9 +77,9 @@ class FreeGrid:
     """
 
     def __init__(self, workspace: Workspace, spacing: float, *, views: int = 1) -> None:
-        """spacing: side of a voxel, metres. views: how many views make a voxel free.
+        """Make a grid; spacing: side of a voxel, metres; views: how many make a voxel free.
 
-        A view is one call of along_rays or from_depth. Raises SettingError for a grid that is too
+        A view is one call of along_rays or from_depth. Raise SettingError for a grid that is too
         large.
         """
         if views not in range(1, MOST_VIEWS + 1):
@@ -94,9 +94,9 @@ class FreeGrid:
         self._grid = MarkedVoxels(marks, self.shape, np.array(workspace.lower), float(spacing))
 
     def along_rays(self, origin: Any, ends: Any) -> int:
-        """One view: mark what segments from origin (3,) or (N, 3) to ends (N, 3) pass, ends too.
+        """Mark, as one view, the segments from origin (3,) or (N, 3) to ends (N, 3), ends too.
 
-        Returns the number of voxels that became free.
+        Return the number of voxels that became free.
         """
         origins, ends = _rows("origin", origin), _rows("ends", ends)
         if len(origins) not in (1, len(ends)):
@@ -113,10 +113,10 @@ class FreeGrid:
         *,
         fraction: float = 0.95,
     ) -> int:
-        """One view: mark along the rays of the masked pixels up to `fraction` of their depth.
+        """Mark, as one view, the rays of the masked pixels up to `fraction` of their depth.
 
-        depth (H, W): metres along z. mask (H, W). Returns the number of voxels that became free.
-        Raises PointsError for another shape than the camera's, PoseError for a pose that is not
+        depth (H, W): metres along z. mask (H, W). Return the number of voxels that became free.
+        Raise PointsError for another shape than the camera's, PoseError for a pose that is not
         rigid.
         """
         require_positive("fraction", fraction)
@@ -132,8 +132,8 @@ class FreeGrid:
     def at(self, points: Any, *, poses: FloatArray = _STAY) -> int:
         """Mark the voxels that points (N, 3) are in when moved by each of poses (P, 4, 4).
 
-        These are free whatever the number of views. Returns the number of voxels that became free.
-        Raises PoseError for poses that are not finite.
+        These are free whatever the number of views. Return the number of voxels that became free.
+        Raise PoseError for poses that are not finite.
         """
         poses = frozen("poses", np.reshape(poses, (-1, 4, 4)), (None, 4, 4), error=PoseError)
         points, least = _rows("points", points), -(-_POINTS_PER_THREAD // max(len(poses), 1))
@@ -141,7 +141,7 @@ class FreeGrid:
         return self._settle(self._views)
 
     def new(self) -> FloatArray:
-        """Centres (M, 3) of the voxels that became free since the last call, in order of index."""
+        """Return centres (M, 3) of voxels that became free since the last call, by index."""
         voxels = np.flatnonzero(self._seen == self._views)
         self._seen[voxels] = _REPORTED
         return self.lattice.centres(np.stack(np.unravel_index(voxels, self.shape), axis=1))
@@ -182,7 +182,7 @@ def _shape(workspace: Workspace, spacing: float) -> tuple[int, int, int]:
 
 
 def _rows(name: str, points: Any) -> FloatArray:
-    """Points (N, 3), finite or not; one point (3,) is a row."""
+    """Return points (N, 3), finite or not; one point (3,) is a row."""
     rows = np.asarray(points, dtype=np.float64)
     rows = rows[None] if rows.shape == (3,) else rows
     rows = np.zeros((0, 3)) if rows.size == 0 else rows
@@ -231,7 +231,7 @@ def mark_points(grid, points, moves, first, last):
 
 @leaf
 def _place(grid, x, y, z):
-    """A point in units of voxels: voxel k is from k to k + 1."""
+    """Return a point in units of voxels: voxel k is from k to k + 1."""
     lower, spacing = grid.lower, grid.spacing
     return (
         (x - lower[0]) / spacing + 0.5,
@@ -306,7 +306,7 @@ def _near(place):
 
 @leaf
 def _clipped(a, d, count, enters, leaves):
-    """The part of a + t d that is within one axis of the grid; empty if enters >= leaves."""
+    """Return the part of a + t d within one axis of the grid; empty if enters >= leaves."""
     if abs(d) < _SHORTEST:
         return (enters, leaves) if 0.0 <= a < count else (1.0, 0.0)
     low, high = -a / d, (count - a) / d
@@ -330,11 +330,11 @@ def _crossings(voxel, last, d):
 def interior_lattice(
     meshes: trimesh.Trimesh | Sequence[trimesh.Trimesh], spacing: float
 ) -> FloatArray:
-    """Nodes (M, 3) inside one closed mesh or inside any of several, in their common frame, metres.
+    """Return nodes (M, 3) inside one or any of several closed meshes, in their frame, metres.
 
     Each mesh has its own lattice around the centre of its bounding box, so that thin parts have
     nodes too. No voxel inside a solid is missed if `spacing` is at most the voxel's side / sqrt(3).
-    Raises SettingError for a spacing that makes too many nodes.
+    Raise SettingError for a spacing that makes too many nodes.
     """
     import trimesh
 
@@ -356,11 +356,11 @@ def interior_lattice(
 
 
 def poses_between(poses: FloatArray, *, step: float, radius: float) -> FloatArray:
-    """Poses (Q, 4, 4) on the path through poses (P, 4, 4), about one step apart.
+    """Return poses (Q, 4, 4) on the path through poses (P, 4, 4), about one step apart.
 
     Nothing within `radius` metres of the frame's origin moves by more than `step` metres from one
     pose to the next. Longer moves are interpolated along straight lines and shortest turns; poses
-    closer together are thinned out, but the first and the last are kept. Raises PoseError for poses
+    closer together are thinned out, but the first and the last are kept. Raise PoseError for poses
     that are not rigid, or so far apart that more than a million are needed.
     """
     require_positive("step", step)
@@ -389,14 +389,14 @@ def poses_between(poses: FloatArray, *, step: float, radius: float) -> FloatArra
 
 
 def _motion(first: FloatArray, second: FloatArray, radius: float) -> FloatArray:
-    """How far (N,) a point can move between poses (N, 4, 4): the shift plus the arc of the turn."""
+    """Return how far (N,) a point can move between poses (N, 4, 4): shift plus arc of the turn."""
     shift = second[:, :3, 3] - first[:, :3, 3]
     turn = product(np.swapaxes(first[:, :3, :3], 1, 2), second[:, :3, :3])
     return np.sqrt((shift**2).sum(axis=1)) + radius * rotation_angle(turn)
 
 
 def _thinned(moves: FloatArray, step: float) -> list[int]:
-    """Indices of P poses, given the P - 1 moves between them: each the last within one step."""
+    """Return indices of P poses, by the P - 1 moves between: each the last within one step."""
     path = np.concatenate([[0.0], np.cumsum(moves)])
     kept, last = [0], len(path) - 1
     while kept[-1] < last:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Protocol
 
@@ -61,9 +61,12 @@ _TRIALS = {
 """Scale, epsilon and configuration of the objects in the paper's trials."""
 MODELS = tuple(_TRIALS)
 """Our own models of these objects of the YCB Object and Model Set, files in `models/`."""
-OBJECTS = {name: ObjectConfig(name, *trial) for name, trial in _TRIALS.items()} | {
-    f"ycb/{name}": ObjectConfig(name, *_TRIALS[name], kind="scan", scan=scan)
-    for scan, name in SCANS.items()
+OBJECTS = {
+    name: ObjectConfig(name, scale, epsilon=epsilon, configuration=configuration)
+    for name, (scale, epsilon, configuration) in _TRIALS.items()
+}
+OBJECTS |= {
+    f"ycb/{name}": replace(OBJECTS[name], kind="scan", scan=scan) for scan, name in SCANS.items()
 }
 """The choices of `object=` but for mesh files."""
 PAPER_RESOLUTION = 0.010  # m: of the SDF grids of these in the paper's simulated trials

@@ -207,7 +207,7 @@ class DepthCamera:
         self.topics = image_topics(rig)
         self.frame = rig.frame
         self._rig = rig
-        self._own: FreeGrid | None = None  # where several views make a voxel free
+        self._views: FreeGrid | None = None  # by views, where several make a voxel free
         self._last_time: int | None = None
         self._reaches = False  # whether its rays reach the workspace
         self._last: tuple[View, BoolArray] | None = None
@@ -218,7 +218,7 @@ class DepthCamera:
         self._camera = camera_of(self._rig, first_pass)
         check_unit(self._rig, first_pass)
         if self._rig.views > 1:
-            self._own = FreeGrid(cell.free.workspace, cell.spacing, views=self._rig.views)
+            self._views = FreeGrid(cell.free.workspace, cell.spacing, views=self._rig.views)
 
     def take(self, time: int, message: ImageMessage, counts: Counts, *, within: bool) -> None:
         """Use an image of the current probe, unless it comes too soon after the last one."""
@@ -237,14 +237,15 @@ class DepthCamera:
             self._cell.warnings.warn(f"{self._rig.name}: an image without a pixel that counts")
             return
         grid = self._cell.free.grid
-        fresh, small = mark_rays(self._own or grid, self._rig, self._cell.gate, view, usable)
-        counts.free += fresh if self._own is None else grid.at(self._own.new())
+        fresh, small = mark_rays(self._views or grid, self._rig, self._cell.gate, view, usable)
+        counts.free += fresh if self._views is None else grid.at(self._views.new())
         counts.small += small
         counts.used += 1
         if not self._reaches:
-            rays = some_rays(self._rig, view, usable)
-            self._reaches = is_entered(self._cell.free.workspace, *rays)
-        self._last_time, self._last = time, (view, usable)
+            origin, ends = some_rays(self._rig, view, usable)
+            self._reaches = is_entered(self._cell.free.workspace, origin, ends)
+        self._last_time = time
+        self._last = (view, usable)
 
     def finish(self, step: int, counts: Counts) -> Sensed:
         """Return the last image of a probe, with the pixels whose rays are free."""

@@ -88,9 +88,15 @@ _WORKSPACES = {"hammer": HAMMER_WORKSPACE, "hammer_fallen": HAMMER_WORKSPACE}
 
 CONFIGURATIONS = {
     name: Configuration(
-        name, of, *_GRIDS[name], position, rotation, _WORKSPACES.get(name, WORKSPACE)
+        name,
+        object_name,
+        y=_GRIDS[name][0],
+        z=_GRIDS[name][1],
+        position=position,
+        rotation=rotation,
+        workspace=_WORKSPACES.get(name, WORKSPACE),
     )
-    for name, (of, position, rotation) in _PLACES.items()
+    for name, (object_name, position, rotation) in _PLACES.items()
 }
 
 

@@ -263,8 +263,8 @@ class DepthFrameSource(ProbeSource):
                 text = f"{key} is {away:.4g} m from the origin; check its unit, which is metres"
                 yield "warning", text
         view = View(frame.depth, found.rays, frame.camera, frame.world_from_camera)
-        rays = some_rays(self._rig.cameras[0], view, found.rays)
-        if found.rays.any() and not is_entered(self.workspace, *rays):
+        origin, ends = some_rays(self._rig.cameras[0], view, found.rays)
+        if found.rays.any() and not is_entered(self.workspace, origin, ends):
             yield "warning", f"{name}: {MISSED}"
         for sensor, counts in ((name, found.counts), ("label", label)):
             if counts is not None and (left_out := counts.left_out()):

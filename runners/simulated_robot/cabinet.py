@@ -144,7 +144,8 @@ def whole_mesh() -> trimesh.Trimesh:
     meshes = [mesh_of(rigid_parts())]
     for side in PADS.values():
         cap = trimesh.creation.icosphere(subdivisions=3).apply_scale(CAP)
-        meshes.append(cap.apply_transform(compose(*_pad(side))))
+        rotation, base = _pad(side)
+        meshes.append(cap.apply_transform(compose(rotation, base)))
     joined: Any = trimesh.util.concatenate(meshes)
     return joined
 

@@ -124,7 +124,10 @@ class _Robot:
         self._enter(0)
         fixed = [(WORLD, CAMERA, self._world_from_camera)]
         fixed += [(WRIST, f"bubble_{pad}_camera", wrist_from_bubble_camera(pad)) for pad in PADS]
-        sent = [log_writer.transform(*parts, self._now) for parts in fixed]
+        sent = [
+            log_writer.transform(parent, child, parent_from_child=pose, stamp=self._now)
+            for parent, child, pose in fixed
+        ]
         self._send("/tf_static", "tf2_msgs/TFMessage", {"transforms": sent})
 
     def stand(self, seconds: float) -> None:

@@ -338,7 +338,7 @@ class JointHistory:
             self._repeated = received
 
     def settle(self, clocks: ClockCorrection, limits: MotionLimits) -> list[str]:
-        """Correct the times of all positions that were added by the clocks.
+        """Return correct the times of all positions that were added by the clocks.
 
         States that are not plausible are left out; returns what a user should know of them.
         """

@@ -30,7 +30,7 @@ def test_the_registry_has_all_sensors_that_a_rig_can_name():
     assert all(is_dataclass(kind) for kind in listed.values())
     assert all(len(getattr(EVERY, name)) > 0 for name in listed)
     named = sum(len(getattr(EVERY, name)) for name in listed)
-    assert len(sensors_of(EVERY, HAND)) == named == 5
+    assert len(sensors_of(EVERY, HAND)) == named
 
 
 @pytest.mark.parametrize("sensor", sensors_of(EVERY, HAND), ids=lambda sensor: sensor.name)

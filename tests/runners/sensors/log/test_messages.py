@@ -6,6 +6,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from chsel.errors import SettingError
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.log.decoding import packed_points
 from runners.sensors.log.images import compressed_pixels, pixel_rows
@@ -166,6 +167,17 @@ def test_a_matrix_that_is_none_of_a_camera_is_refused(tmp_path, k, foxglove):
     listed = ", ".join(f"{value:g}" for value in k)
     expected = f"/info: K is [{listed}]; accepted: fx, 0, cx, 0, fy, cy, 0, 0, 1"
     assert list(log.faults) == [expected]
+
+
+def test_a_little_skew_of_a_driver_is_left_out(tmp_path):
+    topic, kind, message, log_time = next(one for one in ros2_sent(1) if one[0] == "/info")
+    k = [400.0, 0.39, 2.0, 0.0, 410.0, 1.0, 0.0, 0.0, 1.0]  # less than a thousandth of 400
+    write_ros2(
+        tmp_path / "log.mcap", [(topic, kind, {**message, "k": k, "p": [0.0] * 12}, log_time)]
+    )
+    assert by_topic(tmp_path / "log.mcap")["/info"].content == CameraInfoMessage(CAMERA)
+    with pytest.raises(SettingError, match="not a pinhole camera's matrix"):
+        PinholeCamera.of_matrix(np.reshape(k, (3, 3)), 5, 3)
 
 
 def test_a_rectified_matrix_that_is_none_does_not_matter(tmp_path):
