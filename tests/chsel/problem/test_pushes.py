@@ -92,7 +92,7 @@ def test_the_distance_of_pushes_is_found_and_the_pose_is_that_of_the_end():
 
 
 @pytest.mark.parametrize("moves", [MOVES, 0.0])
-def test_a_session_that_was_not_told_notices_that_touches_move_the_object(moves):
+def test_a_session_that_expects_no_moves_notices_that_touches_move_the_object(moves):
     contacts, random = known_points(STANDING, 12).known, np.random.default_rng(3)
     if moves == 0.0:  # contacts that are off otherwise
         contacts = contacts + random.normal(0.0, 0.003, contacts.shape)
