@@ -96,7 +96,7 @@ def test_a_session_that_expects_no_moves_notices_that_touches_move_the_object(mo
     contacts, random = known_points(STANDING, 12).known, np.random.default_rng(3)
     if moves == 0.0:  # contacts that are off otherwise
         contacts = contacts + random.normal(0.0, 0.003, contacts.shape)
-    pin = trimesh.creation.box(bounds=[[-2e-3, -2e-3, -0.02], [2e-3, 2e-3, 0.0]])
+    handle = trimesh.creation.box((0.02, 0.02, 0.02))
     method, recorder = Anchored(AnchoredSettings(size="small")), ListRecorder()
     given = {"resolution": 0.01, "workspace": WORKSPACE, "method": method, "record": recorder}
     with chsel.Session(MESH, **given) as session:
@@ -106,8 +106,8 @@ def test_a_session_that_expects_no_moves_notices_that_touches_move_the_object(mo
             along = np.array([np.cos(angle), np.sin(angle), 0.0])
             across = np.cross([0.0, 0.0, 1.0], along)
             turn = np.stack([np.cross(across, along), across, along], axis=1)
-            end = compose(turn, contact + since - 0.03 * along)  # the pin's inside is behind
-            session.add(hand=pin, path=end[None], contact=contact + since)
+            end = compose(turn, contact + since - 0.8 * along)  # the handle of a long stick
+            session.add(hand=handle, path=end[None], contact=contact + since)
             since += moves * along
         session.register()
         assert session.trust.misfit > 2.0
