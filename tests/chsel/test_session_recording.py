@@ -234,14 +234,14 @@ def test_modes_keep_their_numbers_over_the_steps_of_a_session(recorder):
     first, second = inverse(np.stack([TRUTH, TRUTH @ half_turn]))
     script = [np.stack([first, second]), np.stack([second, first])]
     with chsel.Session(body, method=Scripted(script), record=recorder) as session:
-        told = []
+        numbers = []
         for step, part in enumerate((known[:20], known[20:])):
             session.add(contacts=apply(TRUTH, part))
             assert session.register().trust.verdict == "several modes"
-            told.append([mode.number for mode in session.belief.modes])
+            numbers.append([mode.number for mode in session.belief.modes])
             best = [mode.object_from_world for mode in session.belief.modes]
             np.testing.assert_array_equal(best, script[step])
-    assert told == [[0, 1], [1, 0]]
+    assert numbers == [[0, 1], [1, 0]]
     recorded = events_of(recorder, Believed)
     assert [event.step for event in recorded] == [0, 1]
     for event, poses in zip(recorded, script, strict=True):
@@ -250,4 +250,4 @@ def test_modes_keep_their_numbers_over_the_steps_of_a_session(recorder):
         assert event.covariances.shape == (2, 6, 6)
         centres = apply(inverse(poses), body.centroid[None])[:, 0]
         np.testing.assert_allclose(event.centres, centres, atol=0.01)
-    assert [event.numbers.tolist() for event in recorded] == told
+    assert [event.numbers.tolist() for event in recorded] == numbers

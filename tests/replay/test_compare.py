@@ -20,10 +20,11 @@ from chsel.plausible.plausible_set import plausible_set, save_plausible
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.plausible.pose_metrics import closest_pose, plausible_diversity
 from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance, surface_points
+from chsel.problem.sdf_grid import object_grid
 from chsel.problem.streams import StreamKey
 from replay.__main__ import main
 from replay.comparing.choices import METHOD, chosen, is_recorded, recorded_method
-from replay.comparing.comparison import common_cost, compared, recorded_label
+from replay.comparing.comparison import PlausibleSets, common_cost, compared, recorded_label
 from replay.mcap.reader import read_recording
 from tests.tools.small_recordings import METHODS, registered_session, write_recording
 
@@ -262,6 +263,9 @@ def test_beside_plausible_sets_it_tells_how_far_hypotheses_are_from_them(tmp_pat
     assert float(recorded["coverage_mm2"]) == pytest.approx(expected.coverage, rel=1e-6)
     assert {row["diversity_mm2"] for row in rows if row["step"] == "8"} == {""}
     assert {(row["step"], row["definition"]) for row in rows} == {("8", ""), ("9", "default")}
+    of_another = dataclasses.replace(problem, sdf=object_grid(start.mesh, 0.03))
+    assert PlausibleSets(recording).numbers(problem, found)
+    assert PlausibleSets(recording).numbers(of_another, found) == {}
     assert main([*arguments, "--definition", "paper"]) == 0
     assert "PD" not in capsys.readouterr().out
     assert main([*arguments, "--plausible", str(tmp_path / "nowhere")]) == 2

@@ -11,7 +11,7 @@ import trimesh
 from chsel.belief import PoseBelief
 from chsel.errors import SettingError
 from chsel.methods.anchored.anchored import Anchored
-from chsel.problem.poses import Poses, apply, compose, inverse
+from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import Hypotheses, Trust
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
@@ -152,6 +152,22 @@ def test_the_middle_of_the_members_has_the_true_pose_or_not():
         truth = compose(np.eye(3), np.array(place))
         row = belief_numbers(believed(sdf, members), mesh, sdf, truth, key)
         assert (row["middle_50"], row["middle_90"]) == pytest.approx(middles)
+
+
+def test_turns_count_by_how_far_they_move_the_surface():
+    """Members are 0.1 m apart along each axis, and turned by up to 0.5 rad: that is 13 mm.
+
+    So shifts are the three widest directions, and the truth is among them, though turned farther.
+    """
+    mesh = trimesh.creation.box([0.05, 0.06, 0.07])
+    sdf = SdfGrid.from_mesh(mesh, 0.005)
+    random = np.random.default_rng(0)
+    places, angles = random.uniform(-0.05, 0.05, (400, 3)), random.uniform(-0.5, 0.5, 400)
+    turns = axis_angle(np.tile([0.0, 0.0, 1.0], (400, 1)), angles)
+    truth = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.7)), np.zeros(3))
+    members = believed(sdf, compose(turns, places))
+    row = belief_numbers(members, mesh, sdf, truth, StreamKey(0, 0))
+    assert (row["middle_50"], row["middle_90"]) == (1.0, 1.0)
 
 
 def test_the_best_grasp_works_where_most_members_have_the_object():

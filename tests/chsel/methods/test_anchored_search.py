@@ -7,11 +7,14 @@ formula of chsel/problem/noise.py in numpy.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from chsel.methods.anchor_sampling import most_informative_first
+from chsel.methods.anchored.energy import Energy
 from chsel.methods.anchored.fitting import fitted, twists_of
 from chsel.methods.anchored.walking import stride_of, walked
 from chsel.problem.noise import EXTENT, LEVELS, SHARE, NoiseModel, noise_model
@@ -21,11 +24,13 @@ from chsel.problem.search_space import PlaneSettings, SE3Space, origin_bounds, s
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import object_centre
 from tests.chsel.methods.scene import (
+    BOX,
     BOX_GRID,
     BOX_SIDES,
     STANDING,
     TRUTH,
     WORKSPACE,
+    box_problem,
     energy_of,
     on_faces,
     poses_around_truth,
@@ -184,18 +189,24 @@ def test_a_fit_ends_where_no_motion_lowers_the_plain_formula(points):
     assert abs(known[-1] - 0.03) < 0.003  # the foreign contact moves nothing
 
 
-def test_a_fit_that_goes_far_counts_free_points_that_were_not_near_at_first():
-    """Contacts draw the box by 36 mm onto free points that were 26 mm in front of it."""
+def test_a_step_that_goes_far_counts_free_points_that_were_not_near_at_first():
+    """Contacts draw the box by 36 mm onto free points that were 32 mm in front of it."""
     rough = NoiseModel((0.015,) * LEVELS, (1.0 / LEVELS,) * LEVELS, softness=0.01, wrong=50.0)
-    random = np.random.default_rng(0).uniform(-0.8, 0.8, (300, 2))
-    ahead = np.column_stack([np.full(300, X - 0.01), random * [Y, Z]])
-    points = KnownPoints(known=apply(TRUTH, on_faces(24)), free=apply(TRUTH, ahead))
+    grid, halves = SdfGrid.from_mesh(BOX, 0.004), np.array([X, Y, Z])
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    faces = [signs * np.where(np.arange(3) == axis, 1.0, 0.4) * halves for axis in range(3)]
+    across = np.random.default_rng(0).uniform(-0.8, 0.8, (300, 2)) * [Y, Z]
+    free = np.column_stack([np.full(300, X - 0.004), across])
+    points = KnownPoints(known=apply(TRUTH, np.concatenate(faces)), free=apply(TRUTH, free))
     start = poses_of(turned(0.0, -0.036))
-    found = fitted(energy_of(points, rough), TWISTS, start, 30)
-    before, after = (plain_energies(rough, BOX_GRID, points, p)[0] for p in (start, found))
-    there = plain_energies(rough, BOX_GRID, points, poses_of(TRUTH))[0]
-    assert there > before + 20.0
-    assert after <= before
+    energy = Energy(replace(box_problem(points), sdf=grid), most_informative_first(points), rough)
+    before, there = (plain_energies(rough, grid, points, p)[0] for p in (start, poses_of(TRUTH)))
+    assert there > before + 2.0
+    for steps in (1, 2, 4, 8, 30):
+        found = fitted(energy, TWISTS, start, steps)
+        assert plain_energies(rough, grid, points, found)[0] <= before
+    shift = inverse(found.matrices)[0, :3, 3] - inverse(start.matrices)[0, :3, 3]
+    assert np.sqrt((shift**2).sum()) == pytest.approx(0.032, abs=0.001)  # up to the free points
 
 
 def test_fits_by_rough_then_exact_noise_come_from_afar():

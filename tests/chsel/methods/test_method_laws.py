@@ -86,9 +86,10 @@ def test_the_order_of_points_does_not_matter(name, preset):
 
 @every_method
 def test_contacts_that_count_twice_are_those_of_twice_the_weight(name, preset):
-    """Costs that are means, or matches of each contact, stay as they are."""
-    if name == "cvo":
-        return  # which compares whole clouds, whose free points then weigh half as much
+    """Costs that are means, or matches of each contact, stay as they are.
+
+    `cvo` compares whole clouds, in which free points then weigh half as much.
+    """
     points = replace(FEW, known=np.repeat(FEW.known, 2, axis=0), known_sdf=None)
     method = quick(name, preset)
     found = method.register(replace(PROBLEM, points=points))
@@ -97,17 +98,19 @@ def test_contacts_that_count_twice_are_those_of_twice_the_weight(name, preset):
     if isinstance(cost, CostSettings):
         doubled = settings_mapping(cost) | {"known_scale": 2.0 * cost.known_scale}
         expected = quick(name, preset, cost=doubled).register(PROBLEM)
+    if name == "cvo":
+        assert np.abs(found.object_from_world - expected.object_from_world).max() > 0.01
+        return
     drawn = f"{name}-{preset}".startswith(DRAWS_CONTACTS)
     assert_same(found, expected, all_of_them=not drawn)
 
 
 @every_method
 def test_free_points_that_the_object_cannot_reach_change_no_bit(name, preset):
-    if name == "cvo":
-        return  # whose cost is by the size of the whole cloud
+    """But for `cvo`, whose cost is by the size of the whole cloud."""
     far = replace(FEW, free=np.concatenate([FEW.free, FEW.free + np.array([5.0, 0.0, 0.0])]))
     found = quick(name, preset).register(replace(PROBLEM, points=far))
-    assert found.digest == result(name, preset).digest
+    assert (found.digest == result(name, preset).digest) is (name != "cvo")
 
 
 @every_method

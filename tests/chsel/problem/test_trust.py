@@ -362,6 +362,8 @@ def test_points_that_a_pose_can_fit_exactly_are_no_evidence():
         trust = judged(TURNED_BALL, NOISE, **points)
         assert (trust.verdict, trust.redundancy) == (verdict, count - 6)
         assert ("no evidence" in str(trust)) is (count == 6)
+    filled = judged(TURNED_BALL, NOISE, occupied=at_height(-0.05), known=contacts[:6])
+    assert (filled.verdict, filled.redundancy) == ("determined", 0)
     inside = judged(TURNED_BALL, NOISE, free=at_height(-0.05), known=contacts[:6])
     assert inside.verdict == "nothing fits"  # by evidence of the free points
     assert "no evidence" not in str(inside)
