@@ -20,6 +20,7 @@ from chsel.methods.anchored.walking import stride_of, walked
 from chsel.problem.noise import EXTENT, LEVELS, SHARE, NoiseModel, noise_model
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, rotation_angle
+from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import PlaneSettings, SE3Space, origin_bounds, search_space
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import object_centre
