@@ -67,9 +67,14 @@ def test_objects_of_other_sizes_are_compared_by_the_same_points():
     near = np.concatenate([contacts, contacts + np.array([0.0, 0.0, 0.0029])])
     with chsel.WhichObject({"large": BOX, "small": small}, resolution=0.004) as which:
         which.add(contacts=near)
-        known = {name: session.points for name, session in which.sessions.items()}
-    assert len({points.digest for points in known.values()}) == 1
-    assert len(known["large"].known) == 24
+        counts = {len(session.points.known) for session in which.sessions.values()}
+        look = compose(TRUTH[:3, :3], TRUTH[:3, 3] - 0.3 * TRUTH[:3, 2])
+        seen = {"depth": np.full((30, 40), 0.26), "mask": np.ones((30, 40))}
+        camera = chsel.PinholeCamera(40, 30, 200.0, 200.0, 19.5, 14.5)
+        which.add(**seen, camera=camera, world_from_camera=look)
+        places = {s.points.known.tobytes() for s in which.sessions.values()}
+    assert counts == {24}
+    assert len(places) == 1
     with chsel.Session(BOX, resolution=0.01) as alone:
         alone.add(contacts=near)
         assert len(alone.points.known) == 12

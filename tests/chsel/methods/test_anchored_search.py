@@ -251,18 +251,19 @@ def test_a_step_of_a_fit_is_at_most_80_mm_and_half_a_radian():
     assert rotation_angle(steps[1:, :3, :3])[0] == pytest.approx(2.0 * math.atan(0.25))
 
 
-def test_a_step_of_a_fit_is_that_of_levenberg_and_marquardt():
+@pytest.mark.parametrize("known_points", [AT_ODDS, MANY_AT_ODDS], ids=["25", "73"])
+def test_a_step_of_a_fit_is_that_of_levenberg_and_marquardt(known_points):
     """By the normal equations in numpy, of turns by 1 rad and shifts by 0.15 m about a point."""
     sigma, softness, pivot = 0.3, 0.2, np.array([0.03, -0.05, 0.02])
     wide = NoiseModel((sigma,) * LEVELS, (1.0 / LEVELS,) * LEVELS, softness=softness)
     poses = poses_around_truth(5, 0.005, 0.05)
-    found = fitted(energy_of(AT_ODDS, wide), twists_of(SE3Space(), pivot), poses, 1)
-    points = np.concatenate([AT_ODDS.known, AT_ODDS.free, AT_ODDS.occupied])
-    known, free = len(AT_ODDS.known), len(AT_ODDS.free)
+    found = fitted(energy_of(known_points, wide), twists_of(SE3Space(), pivot), poses, 1)
+    points = np.concatenate([known_points.known, known_points.free, known_points.occupied])
+    known, free = len(known_points.known), len(known_points.free)
     for before, after in zip(poses.matrices, found.matrices, strict=True):
         places = apply(before, points)
         residuals, normals = BOX_GRID.at(places, lookup="trilinear")
-        residuals[:known] -= AT_ODDS.sdf
+        residuals[:known] -= known_points.sdf
         bell = np.exp(-0.5 * (residuals / sigma) ** 2) / (math.sqrt(2.0 * math.pi) * sigma)
         own = (1.0 - SHARE) * bell / ((1.0 - SHARE) * bell + SHARE / EXTENT)  # not foreign
         weights = np.where(np.arange(len(points)) < known, own / sigma**2, 1.0 / softness**2)
