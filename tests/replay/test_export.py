@@ -115,7 +115,7 @@ def test_hypotheses_are_the_recorded_ones(recording, events):
 
 
 def test_modes_are_those_of_the_recorded_beliefs(events, write):
-    covariance = np.diag([1.0, 4.0, 4.0, 0.0, 0.0, 9.0])[None]
+    covariance = np.diag([1.0, 4.0, 4.0, 0.0, 0.0, 16.0])[None]
     poses, centres = np.eye(4)[None], np.array([[0.1, 0.2, 0.3]])
     told = Believed(2, np.array([7]), np.array([0.75]), poses, centres, covariance, 0.01)
     found = next(e for e in events if isinstance(e, HypothesesFound) and e.step == 2)
@@ -123,7 +123,7 @@ def test_modes_are_those_of_the_recorded_beliefs(events, write):
     recording = read_recording(write([*events[:place], told, *events[place:]]))
     (row,) = table(recording, "modes")
     names = ("step", "number", "weight", "x", "y", "z", "position_deviation", "rotation_deviation")
-    assert [float(row[name]) for name in names] == [2, 7, 0.75, 0.1, 0.2, 0.3, 3.0, 3.0]
+    assert [float(row[name]) for name in names] == [2, 7, 0.75, 0.1, 0.2, 0.3, 3.0, 4.0]
     assert same_bits(arrays(recording, "modes")["step_2/covariances"], covariance)
 
 
