@@ -103,17 +103,23 @@ def register(
         require_parts(workspace=workspace)
     if previous is not None:
         what = "the Hypotheses of the registration before, or None"
-        require_instance("previous", previous, Hypotheses, what)
+        require_instance("previous", previous, kind=Hypotheses, accepted=what)
     method = default_method(preset) if method is None else method
     more = None if hypotheses is None else {"online": {"hypotheses": hypotheses}}
     solver = build_method(method, method_settings(method, preset, settings, more))
     sdf = _grid(target, resolution)
-    require_metres("noise", noise_of(solver), MOST_NOISE * sdf.diameter, sdf.diameter)
-    points, repeated = distinct_points(given, KnownPoints(), same_place(sdf.diameter))
+    require_metres("noise", noise_of(solver), most=MOST_NOISE * sdf.diameter, diameter=sdf.diameter)
+    points, repeated = distinct_points(given, KnownPoints(), apart=same_place(sdf.diameter))
     if pushes is not None:  # which count the points
         points, repeated = given, []
-    _warn(check_points(points, sdf.diameter, free_resolution, workspace) + check_contacts(points))
-    _warn(repeated + check_places("the nearest known point", points.all_points(), sdf.diameter))
+    _warn(
+        check_points(points, sdf.diameter, free_resolution=free_resolution, workspace=workspace)
+        + check_contacts(points)
+    )
+    _warn(
+        repeated
+        + check_places("the nearest known point", points.all_points(), diameter=sdf.diameter)
+    )
     if workspace is not None:
         _warn(check_workspace(workspace, sdf.diameter))
     workspace = workspace or workspace_around(points, sdf)
@@ -129,13 +135,13 @@ def register(
     if initial_set is not None:
         problem = replace(problem, initial_set=initial_set)
         places = inverse(problem.initial_set)[:, :3, 3]
-        _warn(check_places("initial_set", places, sdf.diameter, workspace))
+        _warn(check_places("initial_set", places, diameter=sdf.diameter, workspace=workspace))
     if pushes is not None:
         what = "chsel.Pushes(directions, before, largest)"
-        require_instance("pushes", pushes, Pushes, what)
+        require_instance("pushes", pushes, kind=Pushes, accepted=what)
         problem = replace(problem, pushes=pushes)
     result = solver.register(problem, observer)
-    trust = trust_by(solver, problem, result)
+    trust = trust_by(solver, problem, hypotheses=result)
     if trust is not None:
         _warn(check_trust(trust, noise_of(solver)))
     return replace(result, trust=trust)

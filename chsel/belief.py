@@ -104,7 +104,7 @@ class Gripper(CheckedSettings):
         super().__post_init__()
         for name, value in vars(self).items():
             require_positive(name, value)
-            require_at_most(name, value, _WIDEST)
+            require_at_most(name, value, most=_WIDEST)
 
 
 class PoseBelief:
@@ -119,9 +119,9 @@ class PoseBelief:
         self,
         sdf: SdfGrid,
         hypotheses: Hypotheses,
+        *,
         symmetry: ObjectSymmetry | None = None,
         previous: PoseBelief | None = None,
-        *,
         problem: RegistrationProblem | None = None,
         noise: float = SENSOR_NOISE,
     ) -> None:
@@ -138,12 +138,13 @@ class PoseBelief:
             at = np.flatnonzero(kept)
             poses = Poses.of(hypotheses.object_from_world[at])
             carried = problem.carried(hypotheses.push_distance)
-            energies = pose_energies(carried, poses, noise_model(noise))
+            energies = pose_energies(carried, poses, noise=noise_model(noise))
             kept[at[energies > energies.min(initial=np.inf) + LIMIT]] = False
         kept[list(hypotheses.trust.best_of_modes)] = True
         self.object_from_world: FloatArray = hypotheses.object_from_world[kept]
         self.trust: Trust = hypotheses.trust
-        self._sdf, self._poses = sdf, Poses.of(self.object_from_world)
+        self._sdf = sdf
+        self._poses = Poses.of(self.object_from_world)
         self._symmetry = symmetry or grid_symmetry(sdf)
         places = np.cumsum(kept) - 1
         firsts = places[list(hypotheses.trust.best_of_modes)][: self.trust.modes]
@@ -158,16 +159,27 @@ class PoseBelief:
             return []
         apart = outline_distances(self._sdf, self._poses)
         every = np.ones_like(apart, dtype=bool)
-        apart = apart + np.where(turned(self._sdf, self._poses, every), apart.max() + 1.0, 0.0)
+        apart = apart + np.where(
+            turned(self._sdf, self._poses, pairs=every), apart.max() + 1.0, 0.0
+        )
         mode = np.argmin(apart[firsts], axis=0)
-        numbers, found = self._numbers(firsts, previous), []
+        numbers = self._numbers(firsts, previous)
+        found = []
         for n, first in enumerate(firsts):
             members = np.flatnonzero(mode == n)
             weight = len(members) / len(mode)
             best = self.object_from_world[first]
-            off = pose_offsets(self._symmetry, best, self.object_from_world[members])
+            off = pose_offsets(self._symmetry, best, others=self.object_from_world[members])
             covariance = np.asarray((off[:, :, None] * off[:, None]).mean(axis=0))
-            found.append(Mode(numbers[n], weight, best, covariance, members))
+            found.append(
+                Mode(
+                    numbers[n],
+                    weight,
+                    object_from_world=best,
+                    covariance=covariance,
+                    members=members,
+                )
+            )
         return found
 
     def _numbers(self, firsts: IntArray, previous: PoseBelief | None) -> list[int]:
@@ -178,7 +190,7 @@ class PoseBelief:
             old = Poses.of(np.stack([mode.object_from_world for mode in before]))
             both = Poses.joined([self._poses[firsts], old])
             apart = outline_distances(self._sdf, both)
-            away = apart + np.where(turned(self._sdf, both, apart < np.inf), np.inf, 0.0)
+            away = apart + np.where(turned(self._sdf, both, pairs=apart < np.inf), np.inf, 0.0)
             away = away[: len(firsts), len(firsts) :]
             for at in np.argsort(away, axis=None, kind="stable"):
                 n, k = divmod(int(at), len(before))
@@ -187,7 +199,8 @@ class PoseBelief:
                     given[n] = before[k].number
         for n in range(len(firsts)):
             if n not in given:
-                given[n], self.numbers = self.numbers, self.numbers + 1
+                given[n] = self.numbers
+                self.numbers = self.numbers + 1
         return [given[n] for n in range(len(firsts))]
 
     @property
@@ -201,11 +214,11 @@ class PoseBelief:
         return Believed(
             step,
             np.array([mode.number for mode in self.modes], dtype=np.int64),
-            np.array([mode.weight for mode in self.modes]),
-            poses,
-            apply(inverse(poses), self._symmetry.centre[None])[:, 0],
-            np.array([mode.covariance for mode in self.modes]).reshape(-1, 6, 6),
-            self.spread,
+            weights=np.array([mode.weight for mode in self.modes]),
+            object_from_world=poses,
+            centres=apply(inverse(poses), self._symmetry.centre[None])[:, 0],
+            covariances=np.array([mode.covariance for mode in self.modes]).reshape(-1, 6, 6),
+            spread=self.spread,
         )
 
     @property
@@ -249,14 +262,14 @@ class PoseBelief:
         import trimesh
 
         solid = trimesh.Trimesh(hand.vertices, hand.faces, process=False)
-        poses = nearest_rigid("path", frozen("path", path, (None, 4, 4), error=PoseError))
+        poses = nearest_rigid("path", frozen("path", path, shape=(None, 4, 4), error=PoseError))
         side = max(float(solid.extents.min()) / _NODES_ACROSS, _FINEST)
         own = np.concatenate([np.asarray(solid.vertices), interior_lattice(solid, side)])
         met = (self._distances(apply(poses, own).reshape(-1, 3)) < 0.0).any(axis=1)
         return self._chances(np.reshape(met, (-1, 1)))
 
     def grasp_chance(
-        self, world_from_gripper: Any, width: Any, gripper: Gripper | None = None
+        self, world_from_gripper: Any, width: Any, *, gripper: Gripper | None = None
     ) -> Chances:
         """Return the chances (G,) that grasps work, as far as geometry says.
 
@@ -266,18 +279,26 @@ class PoseBelief:
         """
         gripper = gripper or Gripper()
         return self._chances(
-            grasps_work(self._sdf, self._poses, world_from_gripper, width, gripper)
+            grasps_work(
+                self._sdf,
+                self._poses,
+                world_from_gripper=world_from_gripper,
+                width=width,
+                gripper=gripper,
+            )
         )
 
     def best_grasp(
-        self, object_from_gripper: Any, width: Any, gripper: Gripper | None = None
+        self, object_from_gripper: Any, width: Any, *, gripper: Gripper | None = None
     ) -> tuple[FloatArray, float]:
         """Return the pose world_from_gripper (4, 4) of the largest chance to work, and this chance.
 
         object_from_gripper (G, 4, 4), width (G,): grasps of the object, as planned on its mesh.
         They are tried where some members have the object, the best and the modes' among them.
         """
-        grasps = frozen("object_from_gripper", object_from_gripper, (None, 4, 4), error=PoseError)
+        grasps = frozen(
+            "object_from_gripper", object_from_gripper, shape=(None, 4, 4), error=PoseError
+        )
         if len(grasps) == 0:
             raise SettingError("there is no grasp; accepted: at least one")
         modes = [int(mode.members[0]) for mode in self.modes]
@@ -287,12 +308,14 @@ class PoseBelief:
         places = rotated(world[..., :3, :3], grasps[:, :3, 3]) + world[..., :3, 3]
         widths = np.broadcast_to(np.asarray(width, dtype=np.float64), places.shape[:2])
         world = compose(turns, places).reshape(-1, 4, 4)
-        chance = self.grasp_chance(world, widths.reshape(-1), gripper).chance
+        chance = self.grasp_chance(world, widths.reshape(-1), gripper=gripper).chance
         return world[int(np.argmax(chance))], float(chance.max())
 
     def _distances(self, points: Any) -> FloatArray:
         """Return signed distances (K, N) of world points from every member's surface."""
-        return signed_distances(self._sdf, self._poses, frozen("points", points, (None, 3)))
+        return signed_distances(
+            self._sdf, self._poses, points=frozen("points", points, shape=(None, 3))
+        )
 
     def _chances(self, works: np.ndarray) -> Chances:
         """Return shares of members (K, G) for which something holds."""
@@ -305,7 +328,7 @@ class PoseBelief:
         figure = Figure(figsize=(8.0, 4.0), layout="constrained")
         world_from_object = inverse(self.object_from_world)
         stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
-        surface = surface_points(self._sdf, _DRAWN, stream)
+        surface = surface_points(self._sdf, _DRAWN, stream=stream)
         colors = np.full(len(self), "0.6", dtype=object)
         for n, mode in enumerate(self.modes):
             colors[mode.members] = f"C{n}"
@@ -321,13 +344,13 @@ class PoseBelief:
 
 
 def grasps_work(
-    sdf: SdfGrid, poses: Poses, world_from_gripper: Any, width: Any, gripper: Gripper
+    sdf: SdfGrid, poses: Poses, *, world_from_gripper: Any, width: Any, gripper: Gripper
 ) -> np.ndarray:
     """Return whether each grasp (G,) works on the object at each of poses: flags (K, G).
 
     world_from_gripper, width: as `PoseBelief.grasp_chance` takes them.
     """
-    grasps = frozen("world_from_gripper", world_from_gripper, (None, 4, 4), error=PoseError)
+    grasps = frozen("world_from_gripper", world_from_gripper, shape=(None, 4, 4), error=PoseError)
     grasps = nearest_rigid("world_from_gripper", grasps)
     widths = np.broadcast_to(np.asarray(width, dtype=np.float64), (len(grasps),))
     if not ((widths > 0.0) & (widths <= _WIDEST)).all():
@@ -341,13 +364,14 @@ def grasps_work(
     local[:, :count, 1] += np.sign(own[:count, 1]) * 0.5 * widths[:, None]
     local[:, count:, 1] *= widths[:, None]
     world = rotated(grasps[:, None, :3, :3], local) + grasps[:, None, :3, 3]
-    inside = signed_distances(sdf, poses, world.reshape(-1, 3)) < 0.0
+    inside = signed_distances(sdf, poses, points=world.reshape(-1, 3)) < 0.0
     inside = inside.reshape(len(poses), len(grasps), len(own))
-    free, held = ~inside[..., :count].any(axis=-1), inside[..., count:].any(axis=-1)
+    free = ~inside[..., :count].any(axis=-1)
+    held = inside[..., count:].any(axis=-1)
     return np.asarray(free & held & (widths <= gripper.opening))
 
 
-def pose_offsets(symmetry: ObjectSymmetry, own: FloatArray, others: FloatArray) -> FloatArray:
+def pose_offsets(symmetry: ObjectSymmetry, own: FloatArray, *, others: FloatArray) -> FloatArray:
     """Return how poses (M, 4, 4), object_from_world, are off one (4, 4): vectors (M, 6).
 
     Of the object's centre (metres) and the rotation vector (radians), both in world axes, after
@@ -356,7 +380,7 @@ def pose_offsets(symmetry: ObjectSymmetry, own: FloatArray, others: FloatArray) 
     world_from_object = inverse(np.concatenate([own[None], others]))
     centres = apply(world_from_object, symmetry.centre[None])[:, 0]
     rotations = world_from_object[:, :3, :3]
-    turns = product(_nearest_alike(symmetry, rotations[0], rotations[1:]), rotations[0].T)
+    turns = product(_nearest_alike(symmetry, rotations[0], others=rotations[1:]), rotations[0].T)
     return np.concatenate([centres[1:] - centres[0], _rotation_vectors(turns)], axis=1)
 
 
@@ -390,7 +414,7 @@ def _nodes(gripper: Gripper) -> tuple[FloatArray, FloatArray]:
     return fingers, lattice(across, np.linspace(-0.45, 0.45, 5), pad)
 
 
-def _nearest_alike(symmetry: ObjectSymmetry, own: FloatArray, others: FloatArray) -> FloatArray:
+def _nearest_alike(symmetry: ObjectSymmetry, own: FloatArray, *, others: FloatArray) -> FloatArray:
     """Return rotations (M, 3, 3) that look as others do, as near to `own` (3, 3) as possible."""
     if symmetry.sphere:
         return np.broadcast_to(own, others.shape)

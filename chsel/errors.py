@@ -73,26 +73,26 @@ def quoted(value: object) -> str:
     return text if len(text) <= _LONGEST_VALUE else f"a {type(value).__name__}"
 
 
-def require_choice(name: str, value: object, accepted: Iterable[str]) -> None:
+def require_choice(name: str, value: object, *, accepted: Iterable[str]) -> None:
     """Raise SettingError unless `value` is one of the accepted names."""
     accepted = list(accepted)
     if not isinstance(value, str) or value not in accepted:
         raise SettingError(f"{name} is {quoted(value)}; accepted: {', '.join(accepted)}")
 
 
-def require_at_most(name: str, value: float, most: float) -> None:
+def require_at_most(name: str, value: float, *, most: float) -> None:
     """Raise SettingError if `value` is above a limit."""
     if value > most:
         raise SettingError(f"{name} is {value!r}; accepted: at most {most:_}")
 
 
-def require_between(name: str, value: float, low: float, high: float) -> None:
+def require_between(name: str, value: float, *, low: float, high: float) -> None:
     """Raise SettingError unless `value` is a length from `low` to `high`, metres."""
     if not low <= value <= high:
         raise SettingError(f"{name} is {value}; accepted: {low:g} to {high:g} (m)")
 
 
-def require_metres(name: str, value: float, most: float, diameter: float) -> None:
+def require_metres(name: str, value: float, *, most: float, diameter: float) -> None:
     """Raise SettingError if a length is above the most that an object of some diameter allows."""
     if value > most:
         raise SettingError(
@@ -109,7 +109,7 @@ def require_positive(name: str, value: float, *, zero: bool = False) -> None:
         raise SettingError(f"{name} is {quoted(value)}; accepted: a finite number {bound}")
 
 
-def require_instance(name: str, value: object, kind: type, accepted: str) -> None:
+def require_instance(name: str, value: object, *, kind: type, accepted: str) -> None:
     """Raise SettingError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
         raise SettingError(f"{name} is {quoted(value)}; accepted: {accepted}")

@@ -33,7 +33,7 @@ class Start:
     steps: tuple[int, ...] | None = None  # of no others than these; None: of all
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SessionStarted:
     """Opens every recording."""
 
@@ -86,7 +86,7 @@ class ActionsOffered:
     hand: HandShape  # that takes them
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SensorImage:
     """An image from which known points of a step come; it precedes the step's probe."""
 

@@ -93,12 +93,12 @@ class WhichObject:
             assert session.problem is not None
             poses = Poses.of(answer.object_from_world[np.isfinite(answer.cost)])
             problem = session.problem.carried(answer.push_distance)
-            energies = pose_energies(problem, poses, noise_model(self._noise))
+            energies = pose_energies(problem, poses, noise=noise_model(self._noise))
             found.append((float(energies.min(initial=np.inf)), name, answer))
         least = min(energy for energy, *_ in found)
         found.sort(key=lambda one: one[0])
         self.candidates = [
-            Candidate(name, energy, energy <= least + LIMIT, answer)
+            Candidate(name, energy, alive=energy <= least + LIMIT, answer=answer)
             for energy, name, answer in found
         ]
         return self.candidates
@@ -111,7 +111,8 @@ class WhichObject:
         offered = self._offered if actions is None else actions
         offered = session.actions() if offered is None else offered
         if self._offered is None or offered.digest != self._offered.digest:
-            self._offered, self._taken = offered, set()
+            self._offered = offered
+            self._taken = set()
         probe = session.next_probe(offered, without=self._taken)
         if probe is not None:
             self._taken.add(probe.action)

@@ -11,7 +11,8 @@ class FieldComments(Extension):
     def on_attribute_instance(self, *, attr: Attribute, **_: object) -> None:
         if attr.docstring is not None or attr.parent is None or not attr.parent.is_class:
             return
-        before, line = attr.lines_collection[attr.filepath][: attr.lineno - 1], attr.source
+        before = attr.lines_collection[attr.filepath][: attr.lineno - 1]
+        line = attr.source
         found = re.search(r"  # (.*)", line)
         parts = [found[1]] if found else []
         while not found and before and before[-1].lstrip().startswith("# "):

@@ -24,7 +24,8 @@ TOUCHED = """0.5028,0.0938,0.0758
 0.4102,0.0947,0.0270"""
 
 files = sys.argv[1:] or (MUSTARD, TOUCHED.splitlines())
-mesh, contacts = chsel.load_mesh(files[0]), np.loadtxt(files[1], delimiter=",", ndmin=2)
+mesh = chsel.load_mesh(files[0])
+contacts = np.loadtxt(files[1], delimiter=",", ndmin=2)
 hypotheses = chsel.register(mesh, contacts=contacts)
 print(f"{len(contacts)} contacts: {hypotheses.trust}")
 for index in hypotheses.trust.best_of_modes:

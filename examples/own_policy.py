@@ -27,7 +27,8 @@ class FromAbove(ConfiguredPolicy[FromAboveSettings]):
 
 for bonus in (0.0, 0.5):
     robot = FakeRobot(chsel.load_mesh(MUSTARD), TRUTH)
-    policy, downward = FromAbove(FromAboveSettings(bonus=bonus, probes=8)), 0
+    policy = FromAbove(FromAboveSettings(bonus=bonus, probes=8))
+    downward = 0
     with chsel.Session(MUSTARD, hand=FINGER, workspace=TABLE, policy=policy) as session:
         while (probe := session.next_probe()) is not None:
             path, contact = robot.touch(probe.world_from_hand, probe.length)

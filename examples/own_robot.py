@@ -20,7 +20,8 @@ class FakeRobot:
 
     def touch(self, start, length):
         """Move the hand along its z axis: its path (2, 4, 4), and the contact (3,) or None."""
-        along, tip = start[:3, 2], start[:3, 3] + 0.03 * start[:3, 2]
+        along = start[:3, 2]
+        tip = start[:3, 3] + 0.03 * start[:3, 2]
         hits = self.scene.ray.intersects_location([tip], [along])[0]
         way = min([length, *((hits - tip) @ along)])
         end = start + np.outer([*(way * along), 0.0], [0.0, 0.0, 0.0, 1.0])

@@ -11,7 +11,8 @@ import sys
 import urllib.error
 import urllib.request
 
-SERVER, TOKEN = f"http://127.0.0.1:{sys.argv[1]}", os.environ["CHSEL_TOKEN"]
+SERVER = f"http://127.0.0.1:{sys.argv[1]}"
+TOKEN = os.environ["CHSEL_TOKEN"]
 X, Y, Z = 0.05, 0.03, 0.1  # half the sides of a box, metres; it is at (0.4, 0, 0.1)
 
 
@@ -43,7 +44,10 @@ touched += [(0.03, 0.02, Z), (-0.04, -0.02, Z)]
 ask(f"{session}/add", contacts=[[x + 0.4, y, z + 0.1] for x, y, z in touched])
 
 # A camera half a metre in front of it looks along the world's y axis, at a wall 1 m away.
-width, height, focus, to_box = 64, 48, 60.0, 0.5 - Y
+width = 64
+height = 48
+focus = 60.0
+to_box = 0.5 - Y
 depth = []
 for row in range(height):
     for column in range(width):

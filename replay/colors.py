@@ -99,7 +99,8 @@ class CostScale:
 
 def score_fractions(score: FloatArray) -> FloatArray:
     """Return place (A,) of each finite score, from the lowest (0) to the highest (1), or all 1."""
-    low, high = float(score.min(initial=np.inf)), float(score.max(initial=-np.inf))
+    low = float(score.min(initial=np.inf))
+    high = float(score.max(initial=-np.inf))
     return (score - low) / (high - low) if high > low else np.ones(len(score))
 
 

@@ -24,7 +24,7 @@ _MOST_LABELS = 0.6  # of the width of a terminal: texts that stand beside each p
 
 
 def printable(text: str, *, keep: str = "") -> str:
-    """Return the text with every character that would steer a terminal escaped, such as \\x1b.
+    r"""Return the text with every character that would steer a terminal escaped, such as \x1b.
 
     keep: characters that stay as they are.
     """

@@ -56,7 +56,7 @@ def new_file(path: Path) -> Iterator[Path]:
     require_folder(path)
     beside = _beside(path)
     try:
-        with _placed(beside, path, _rename):
+        with _placed(beside, path, rename=_rename):
             yield beside
     except (OSError, RecordingError) as error:
         reason = disk_error(error, beside)
@@ -74,7 +74,7 @@ def whole_file(path: Path, accepted: str = "an out=DIR that can be written") -> 
     beside = _beside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _placed(beside, path, Path.replace):
+        with _placed(beside, path, rename=Path.replace):
             yield beside
     except (OSError, RecordingError) as error:
         reason = error if isinstance(error, OSError) else error.__context__
@@ -90,7 +90,7 @@ def _beside(path: Path) -> Path:
 
 
 @contextmanager
-def _placed(beside: Path, path: Path, rename: Callable[[Path, Path], object]) -> Iterator[None]:
+def _placed(beside: Path, path: Path, *, rename: Callable[[Path, Path], object]) -> Iterator[None]:
     """Give a file that is written within this context its name, once it is on the disk."""
     try:
         yield
@@ -127,7 +127,7 @@ def _rename(beside: Path, path: Path) -> None:
 
 def file_digest(path: Path) -> str:
     """Return BLAKE2b (128 bit, hexadecimal) of a file's bytes, as `b2sum -l 128` prints it."""
-    refuse_special_file(str(path), path, RecordingError)
+    refuse_special_file(str(path), path, error=RecordingError)
     try:
         with path.open("rb") as file:
             state = hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=_DIGEST_SIZE))

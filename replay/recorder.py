@@ -58,7 +58,8 @@ class Recorders(Recorder):
         optional: what to do about pictures that cannot be drawn. Where this is given, a
         RecordingError of theirs is a warning that ends with it, and no more is drawn.
         """
-        self._files, self._pictures = tuple(files), pictures
+        self._files = tuple(files)
+        self._pictures = pictures
         self._most = 0 if live else _MOST
         self._optional = optional
         self._waiting: list[Event] = []

@@ -49,7 +49,7 @@ def begin() -> None:
         sys.exit(2)
 
 
-def _name_missing_extra(
+def _name_missing_extra(  # noqa: PLR0917
     kind: type[BaseException], error: BaseException, trace: TracebackType | None
 ) -> None:
     name = ((error.name or "") if isinstance(error, ModuleNotFoundError) else "").split(".")[0]

@@ -65,19 +65,23 @@ class AlignConfig(SourceConfig):
 @command("align")
 def main(config: DictConfig) -> None:
     """Search, say what was found, and write the pose with a picture of it."""
-    checked = build_settings(AlignConfig, plain(config), "align")
-    guess, search, pose_path = checked.guess(), checked.search, beside(checked.path)
+    checked = build_settings(AlignConfig, plain(config), where="align")
+    guess = checked.guess()
+    search = checked.search
+    pose_path = beside(checked.path)
     pose_path = checked.folder(pose_path.parent) / pose_path.name
     view_path = pose_path.with_name(pose_path.name.removesuffix(SUFFIX) + ".pose.rrd")
     for written in (pose_path, view_path):
         if written.exists() and not checked.overwrite:
             raise RecordingError(f"{written} exists; accepted: overwrite=true, or another out=DIR")
     source = checked.open()
-    problem, truth = source.problems.problem(source.steps[-1]), source.world_from_object
+    problem = source.problems.problem(source.steps[-1])
+    truth = source.world_from_object
     with threads(checked.threads):
-        pose, numbers = sought_pose(problem, source.mesh, guess, search, truth)
-    guessed = {"cost": numbers["guess_cost"], **fit(problem, guess, search)}
-    points, console = problem.points, Console(soft_wrap=True)
+        pose, numbers = sought_pose(problem, source.mesh, guess=guess, settings=search, truth=truth)
+    guessed = {"cost": numbers["guess_cost"], **fit(problem, guess, settings=search)}
+    points = problem.points
+    console = Console(soft_wrap=True)
     title = (
         f"{source.object}, after probe {problem.key.step}: {len(points.contacts)} contacts, "
         f"{len(points.free)} free points"
@@ -98,7 +102,7 @@ def main(config: DictConfig) -> None:
     if truth is not None:
         apart = _apart(numbers["from_known"])
         console.print(f"from the true pose that the recording has: {apart}")
-    for warning in _warnings(pose, guess, numbers, search):
+    for warning in _warnings(pose, guess, numbers=numbers, search=search):
         console.print(f"warning: {warning}")
     about = {
         "object": source.object,
@@ -110,8 +114,8 @@ def main(config: DictConfig) -> None:
     }
     pose_path.parent.mkdir(parents=True, exist_ok=True)
     view_path.unlink(missing_ok=True)
-    save_view(view_path, source.mesh, problem, guess, pose)
-    write_pose(pose_path, pose, about, overwrite=checked.overwrite)
+    save_view(view_path, source.mesh, problem=problem, guess=guess, found=pose)
+    write_pose(pose_path, pose, about=about, overwrite=checked.overwrite)
     print_written(pose_path, view_path)
 
 
@@ -120,11 +124,13 @@ def _apart(distance: dict[str, float]) -> str:
 
 
 def _warnings(
-    pose: FloatArray, guess: FloatArray, numbers: dict[str, Any], search: TruePoseSettings
+    pose: FloatArray, guess: FloatArray, *, numbers: dict[str, Any], search: TruePoseSettings
 ) -> list[str]:
     """Return reasons against the result."""
-    offset, turned = np.abs(pose[:3, 3] - guess[:3, 3]), numbers["from_guess"]["rotation"]
-    axis, tolerance = "xyz"[int(np.argmax(offset))], 1000.0 * search.cost.tolerance
+    offset = np.abs(pose[:3, 3] - guess[:3, 3])
+    turned = numbers["from_guess"]["rotation"]
+    axis = "xyz"[int(np.argmax(offset))]
+    tolerance = 1000.0 * search.cost.tolerance
     doubts = (
         (
             offset.max() > search.reach - search.spacing,
@@ -148,6 +154,7 @@ def _warnings(
 def save_view(
     path: Path,
     mesh: trimesh.Trimesh,
+    *,
     problem: RegistrationProblem,
     guess: FloatArray,
     found: FloatArray,
@@ -160,8 +167,8 @@ def save_view(
         )
         stream.send_blueprint(at_last_probe(rrb.Vertical(view)))
         scene = Scene(stream)
-        scene.set_up(mesh, problem.workspace, found)
-        scene.add_mesh("guess", mesh, guess, _GUESS_COLOR)
+        scene.set_up(mesh, problem.workspace, world_from_object=found)
+        scene.add_mesh("guess", mesh, world_from_mesh=guess, color=_GUESS_COLOR)
         scene.add_points(problem.points)
 
 

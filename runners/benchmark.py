@@ -50,9 +50,9 @@ class BenchmarkConfig:
         StreamKey(self.seed, 0)
         require_positive("repeats", self.repeats)
         for problem in (*self.problems, *self.package.equation):
-            require_choice("problem", problem, PROBLEMS)
+            require_choice("problem", problem, accepted=PROBLEMS)
         for measure in self.alone:
-            require_choice("alone", measure, MEASURES)
+            require_choice("alone", measure, accepted=MEASURES)
 
     def shortened(self) -> BenchmarkConfig:
         """Return a configuration of less than a minute, whose times are not to be quoted."""
@@ -70,7 +70,7 @@ class BenchmarkConfig:
 def main(config: DictConfig) -> None:
     """Run the benchmark; what is measured so far is always in its files."""
     values = plain(config)
-    checked = build_settings(BenchmarkConfig, values, "benchmark")
+    checked = build_settings(BenchmarkConfig, values, where="benchmark")
     if checked.quick:
         checked = checked.shortened()
     torch.set_num_threads(1)
@@ -94,7 +94,7 @@ def main(config: DictConfig) -> None:
                 status.update(f"measuring {name}")
                 for row in measured:
                     rows.append(row)
-                    benchmark_report.write(folder, rows, about)
+                    benchmark_report.write(folder, rows, about=about)
     for line in benchmark_report.page(rows, about):
         console.print(line)
     for path in sorted(folder.iterdir()):
@@ -105,9 +105,9 @@ def _measures(
     config: BenchmarkConfig, package: PublishedPackage | None
 ) -> Iterator[tuple[str, Iterator[Row]]]:
     """Yield the measurements by name; rows are measured as they are taken."""
-    scope = Scope(config.steps, config.repeats, config.seed)
+    scope = Scope(config.steps, config.repeats, seed=config.seed)
     for name in config.problems:
-        yield name, compare(name, scope, package, equation=name in config.package.equation)
+        yield name, compare(name, scope, package=package, equation=name in config.package.equation)
     for name in config.alone:
         yield name, MEASURES[name](scope)
 

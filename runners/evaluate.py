@@ -80,31 +80,34 @@ class EvaluateConfig(CheckedSettings):
 @command("evaluate")
 def main(config: DictConfig) -> None:
     """Do what is not done yet, and collect all that is there."""
-    checked = build_settings(EvaluateConfig, plain(config), "evaluate")
+    checked = build_settings(EvaluateConfig, plain(config), where="evaluate")
     if checked.policies is None:
         accepted = "policies=all, or a list of policies, with it"
         require_used("policy", reason="policies is null", accepted=accepted)
-    plan, console = _plan(checked), Console(soft_wrap=True)
+    plan = _plan(checked)
+    console = Console(soft_wrap=True)
     if plan.kind != SENSORS:
         reason = f"true poses are sought in logs, and the session is {plan.kind}"
         require_used("truth", reason=reason, accepted=f"session={SENSORS} with it")
-    levels = chosen_names("faults", checked.faults, [CLEAN] if plan.kind == SENSORS else LEVELS)
+    levels = chosen_names(
+        "faults", checked.faults, existing=[CLEAN] if plan.kind == SENSORS else LEVELS
+    )
     clean = {name: one.object for name, one in plan.configurations.items() if one.faults == CLEAN}
-    chosen = chosen_names("configurations", checked.configurations, clean, clean)
+    chosen = chosen_names("configurations", checked.configurations, existing=clean, objects=clean)
     configurations = [faulty_name(name, level) for name in chosen for level in levels]
     seeds = chosen_seeds(checked.seeds)
     trials = [Trial(seed, name) for seed in seeds for name in configurations]
-    _check(plan, trials, levels)
+    _check(plan, trials, levels=levels)
     with writing_alone(plan.folder, console.print):
-        join_experiment(plan, checked.name, configurations, seeds)
+        join_experiment(plan, checked.name, configurations=configurations, seeds=seeds)
         for unfinished in plan.folder.glob("trials/*/*/.*"):  # of a run that was killed
             unfinished.unlink()
-        failed = evaluate(plan, trials, checked, console)
+        failed = evaluate(plan, trials, config=checked, console=console)
     if failed and HydraConfig.get().mode is not RunMode.MULTIRUN:  # the other jobs must go on
         sys.exit(1)
 
 
-def evaluate(plan: Plan, trials: list[Trial], config: EvaluateConfig, console: Console) -> bool:
+def evaluate(plan: Plan, trials: list[Trial], *, config: EvaluateConfig, console: Console) -> bool:
     """Do all tasks that are not finished, and write the tables; whether anything failed."""
     tasks = tasks_of(plan, trials)
     missing = [task for task in tasks if not is_finished(plan, task)]
@@ -120,7 +123,7 @@ def evaluate(plan: Plan, trials: list[Trial], config: EvaluateConfig, console: C
                 Progress(console=console, transient=True, disable=not console.is_terminal) as bar,
             ):
                 shown = bar.add_task("tasks", total=len(missing))
-                for task, failure in do_tasks(plan, missing, client, size):
+                for task, failure in do_tasks(plan, missing, client=client, workers=size):
                     bar.update(shown, advance=1, description=str(task))
                     if failure:
                         console.print(f"failed: {task}: {failure}")
@@ -145,7 +148,8 @@ def _plan(config: EvaluateConfig) -> Plan:
         return Path(str(folder)).expanduser().absolute()
 
     policies = chosen_policies(config.policies, config.policy)
-    preset, logs = config.preset.name, config.session.get("logs")
+    preset = config.preset.name
+    logs = config.session.get("logs")
     session = without_defaults(config.session)
     return Plan(
         folder=path(config.out),
@@ -159,7 +163,9 @@ def _plan(config: EvaluateConfig) -> Plan:
         every=config.iterations["every"],
         recordings=config.recordings,
         assets=path(config.assets.folder),
-        contenders=chosen_contenders(config.methods, config.settings, preset, config.draws),
+        contenders=chosen_contenders(
+            config.methods, config.settings, preset=preset, draws=config.draws
+        ),
         outside=external_folders({str(name): path(f) for name, f in config.outside.items()}),
         logs=None if logs is None else path(logs),
         truth=config.truth,
@@ -168,7 +174,7 @@ def _plan(config: EvaluateConfig) -> Plan:
     )
 
 
-def _check(plan: Plan, trials: list[Trial], levels: tuple[str, ...]) -> None:
+def _check(plan: Plan, trials: list[Trial], *, levels: tuple[str, ...]) -> None:
     """Raise the errors that all trials would have, before any work."""
     of_policies = (len(plan.contenders), plan.kind == SENSORS, plan.starts, plan.steps, plan.every)
     if plan.policies and (of_policies != (1, False, OWN, None, None) or plan.outside):
@@ -208,7 +214,7 @@ def _check(plan: Plan, trials: list[Trial], levels: tuple[str, ...]) -> None:
         if not folder.is_dir():
             raise SettingError(f"outside.{label} is {folder}; accepted: a folder")
         for trial in trials:
-            read_external(plan, trial, label)
+            read_external(plan, trial, label=label)
 
 
 if __name__ == "__main__":

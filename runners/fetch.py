@@ -16,8 +16,8 @@ from runners.objects.scans import AssetsConfig, download_scan, scan_folder
 def main(config: DictConfig) -> None:
     """Download the scan of the chosen object into the assets folder, unless it is there."""
     settings = plain(config)
-    assets = build_settings(AssetsConfig, settings["assets"], "assets")
-    chosen = build_settings(ObjectConfig, settings["object"], "object")
+    assets = build_settings(AssetsConfig, settings["assets"], where="assets")
+    chosen = build_settings(ObjectConfig, settings["object"], where="object")
     if chosen.kind != "scan" or chosen.scan is None:
         raise SettingError("this object needs no download; accepted: object=ycb/NAME")
     scan = chosen.scan

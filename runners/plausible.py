@@ -54,8 +54,9 @@ class PlausibleConfig(SourceConfig):
 @command("plausible")
 def main(config: DictConfig) -> None:
     """Make, or find, the set of every step, and print what they hold."""
-    checked = build_settings(PlausibleConfig, plain(config), "plausible")
-    source, console = checked.open(), Console()
+    checked = build_settings(PlausibleConfig, plain(config), where="plausible")
+    source = checked.open()
+    console = Console()
     steps = chosen_steps(None if checked.steps is None else str(checked.steps), source.steps)
     folder = checked.folder(checked.path.parent / "plausible")
     if checked.definition.get("epsilon") is None and source.epsilon is None:
@@ -66,7 +67,7 @@ def main(config: DictConfig) -> None:
     settings = definition_settings(checked.definition, source.epsilon)
     truth = source.world_from_object
     truth = pose_beside(checked.path) if truth is None else truth
-    metrics = HypothesisMetrics(checked.metrics, source.mesh, truth)
+    metrics = HypothesisMetrics(checked.metrics, source.mesh, world_from_object=truth)
     rows: list[dict[str, Any]] = []
     failures: list[str] = []
     waiting = Console(stderr=True)
@@ -75,9 +76,10 @@ def main(config: DictConfig) -> None:
         Progress(console=waiting, transient=True, disable=not waiting.is_terminal) as progress,
     ):
         for step in progress.track(steps, description="plausible sets"):
-            problem, begun = source.problems.problem(step), time.perf_counter()
+            problem = source.problems.problem(step)
+            begun = time.perf_counter()
             try:
-                found, was_there = made_set(folder, problem, truth, settings)
+                found, was_there = made_set(folder, problem, truth=truth, settings=settings)
             except EvaluationError as error:
                 failures.append(f"step {step}: {error}")
                 continue
@@ -90,7 +92,7 @@ def main(config: DictConfig) -> None:
                     "local": int(found.local.sum()),
                     "true_cost": found.true_cost,
                     "seconds": "found" if was_there else time.perf_counter() - begun,
-                    **metrics.compute(problem, found, source.problems.hypotheses(step)),
+                    **metrics.compute(problem, found, found=source.problems.hypotheses(step)),
                 }
             )
     shown = [key for key in _COLUMNS if any(key in row for row in rows)]

@@ -42,9 +42,10 @@ from runners.sessions.source import ObjectOrigin
 def main(config: DictConfig) -> None:
     """Run one session."""
     values = plain(config)
-    checked = build_settings(ProbeConfig, values, "probe")
+    checked = build_settings(ProbeConfig, values, where="probe")
     _require_used_settings(checked)
-    method_config, kind = dict(checked.method), checked.session.get("kind")
+    method_config = dict(checked.method)
+    kind = checked.session.get("kind")
     method_name = str(method_config.pop("name", None))
     title = f"{kind} session, {method_name}, preset {checked.preset.name}, seed {checked.seed}"
     if source_kind(kind).object is not ObjectOrigin.RECORDED:  # that is known once it is read
@@ -67,7 +68,7 @@ def main(config: DictConfig) -> None:
                 warm_up_sensing()
         folder = make_run_folder(Path(checked.logs) / "probe", setup.object_name, method_name)
         write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
-        started = session_started(checked, values, method_name, setup)
+        started = session_started(checked, values, method_name=method_name, setup=setup)
         with Interrupt() as interrupt:
             interrupted = run_session(
                 folder,

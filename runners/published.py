@@ -68,12 +68,14 @@ class PublishedConfig:
 @command("published")
 def main(config: DictConfig) -> None:
     """Register what is not registered yet."""
-    checked = build_settings(PublishedConfig, plain(config), "published")
+    checked = build_settings(PublishedConfig, plain(config), where="published")
     trials = found_trials(checked)
     console = Console(soft_wrap=True)
     with PublishedPackage(interpreter(checked.package, console.print)) as package:
         sessions = [
-            PackageSession(package, checked.folder, trial, draw, session, steps)
+            PackageSession(
+                package, checked.folder, trial=trial, draw=draw, session=session, steps=steps
+            )
             for draw in range(checked.draws)
             for trial, session in trials
             if (steps := tuple(read_told(session.parent)["steps"]))
@@ -108,7 +110,9 @@ def found_trials(config: PublishedConfig) -> list[tuple[Trial, Path]]:
     """
     folder = Path(config.dir or "").expanduser()
     experiment = read_experiment(folder)
-    names = chosen_names("configurations", config.configurations, experiment["configurations"])
+    names = chosen_names(
+        "configurations", config.configurations, existing=experiment["configurations"]
+    )
     seeds = experiment["seeds"] if config.seeds is None else chosen_seeds(config.seeds)
     trials = sorted(Trial(seed, name) for seed in seeds for name in names)
     place = "trials/{0.configuration}/seed_{0.seed}/session.mcap"
@@ -162,12 +166,12 @@ class PackageSession:
 
     def register(self) -> Iterator[int]:
         """Yield each step when the package is done with it; the files exist at the end."""
-        session = RecordedSource(RecordedSettings(str(self.session), 0, 0))
+        session = RecordedSource(RecordedSettings(str(self.session), 0, start_probe=0))
         arrays: dict[str, Any] = {}
         about: dict[str, Any] = {"failed": {}, "cpu_seconds": {}, "free_points": {}}
 
         def register(problem: RegistrationProblem) -> Hypotheses:
-            found, answer = registered(self.package, problem, session.recorded.mesh)
+            found, answer = registered(self.package, problem, mesh=session.recorded.mesh)
             step = problem.key.step
             arrays[f"step_{step}"] = inverse(found.object_from_world)
             arrays[f"cost_{step}"] = found.cost
@@ -201,7 +205,7 @@ class PackageSession:
 
 
 def registered(
-    package: PublishedPackage, problem: RegistrationProblem, mesh: trimesh.Trimesh
+    package: PublishedPackage, problem: RegistrationProblem, *, mesh: trimesh.Trimesh
 ) -> tuple[Hypotheses, Mapping[str, Any]]:
     """Return the hypotheses of the package with its own settings, best first, and its answer."""
     package.load(problem, mesh.bounds)
@@ -215,7 +219,9 @@ def registered(
         raise RefusedError("a cost of the package is not finite")
     order = np.argsort(cost, kind="stable")
     poses, cells = poses[order], np.full(len(poses), -1, dtype=np.int64)
-    return Hypotheses(poses, cost[order], repeated(Poses.of(poses)), cells, elites), answer
+    return Hypotheses(
+        poses, cost[order], duplicate=repeated(Poses.of(poses)), cell=cells, elites=elites
+    ), answer
 
 
 if __name__ == "__main__":

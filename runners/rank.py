@@ -30,7 +30,8 @@ class RankConfig(CheckedSettings):
 @command("rank")
 def main(config: DictConfig) -> None:
     """Print which rows are the same to the bit, and the table with all rows of both."""
-    checked, console = build_settings(RankConfig, plain(config), "rank"), Console()
+    checked = build_settings(RankConfig, plain(config), where="rank")
+    console = Console()
     for shown in ranking(Path(checked.dir or "").expanduser()):
         if isinstance(shown, Table):
             print_table(console, shown)

@@ -86,14 +86,15 @@ class RealConfig(CheckedSettings):
 @command("real")
 def main(config: DictConfig) -> None:
     """Register every case with every method and seed, and print medians."""
-    checked = build_settings(RealConfig, plain(config), "real")
-    cases = chosen_names("only", checked.only, checked.cases)
-    seeds, console = chosen_seeds(checked.seeds), Console()
+    checked = build_settings(RealConfig, plain(config), where="real")
+    cases = chosen_names("only", checked.only, existing=checked.cases)
+    seeds = chosen_seeds(checked.seeds)
+    console = Console()
     if checked.data is None or not (Path(checked.data).expanduser() / "real").is_dir():
         raise SettingError(
             f"data is {checked.data}; accepted: a folder with real/, by data=FOLDER or CHSEL_DATA"
         )
-    contenders = chosen_contenders(checked.methods, checked.settings, checked.preset.name)
+    contenders = chosen_contenders(checked.methods, checked.settings, preset=checked.preset.name)
     methods = {label: contender.method() for label, contender in contenders.items()}
     rows: list[Mapping[str, Any]] = []
     with threads(checked.threads):
@@ -120,18 +121,22 @@ class RealCase:
 
     def __init__(self, config: RealConfig, name: str) -> None:
         """Open the session; raise SettingError if there are too few touches."""
-        case = build_settings(CaseConfig, config.cases[name], f"cases.{name}")
+        case = build_settings(CaseConfig, config.cases[name], where=f"cases.{name}")
         folder = Path(config.data or "").expanduser() / "real"
         model = {"name": name, "scale": 1.0, "epsilon": _EPSILON, "configuration": name}
         model |= {"kind": "file", "path": str(folder / case.mesh)}
         frame = Path(case.path).suffix.lower() in FRAMES
         session = {"kind": "sensors", "rig": config.rig} if frame else {"kind": "points"}
-        self._source = open_problem_file(folder / case.path, model, session, folder, 0)
+        self._source = open_problem_file(
+            folder / case.path, model, session=session, assets=folder, seed=0
+        )
         self._given = self._source.problems.problem(self._source.steps[-1])
         self._touches = self._given.points.contacts
         if len(self._touches) < 2:
             raise SettingError(f"{name} has {len(self._touches)} touches; accepted: from 2")
-        self._symmetry, self._config, self._name = object_symmetry(self._source.mesh), config, name
+        self._symmetry = object_symmetry(self._source.mesh)
+        self._config = config
+        self._name = name
 
     def rows(self, methods: Mapping[str, Method], seeds: Sequence[int]) -> Iterator[dict[str, Any]]:
         """Yield a row for every method and seed and, where wanted, another of half of the touches.
@@ -141,12 +146,14 @@ class RealCase:
         every = np.arange(len(self._touches))
         for (label, method), seed in product(methods.items(), seeds):
             about = {"case": self._name, "method": label, "seed": seed}
-            yield {**about, "points": _ALL, **self._numbers(method, seed, every)}
+            yield {**about, "points": _ALL, **self._numbers(method, seed, kept=every)}
             if self._config.halves:
                 stream = StreamKey(seed, 0).stream(Purpose.CONTACT_POINTS, _SPLIT)
-                order = np.argsort(uniforms(stream, 0.0, 1.0, len(every)), kind="stable")
+                order = np.argsort(
+                    uniforms(stream, 0.0, upper=1.0, shape=len(every)), kind="stable"
+                )
                 kept = np.sort(order[: (len(every) + 1) // 2])
-                yield {**about, "points": _HALF, **self._numbers(method, seed, kept)}
+                yield {**about, "points": _HALF, **self._numbers(method, seed, kept=kept)}
         if (truth := self._source.world_from_object) is not None:
             about = {"case": self._name, "method": "(published)", "points": _ALL}
             yield about | self._counts(every, inverse(truth[None])[0])
@@ -163,7 +170,7 @@ class RealCase:
             **dict.fromkeys(("position_error", "rotation_error", "right", "truth_held")),
         }
 
-    def _numbers(self, method: Method, seed: int, kept: IntArray) -> dict[str, Any]:
+    def _numbers(self, method: Method, seed: int, *, kept: IntArray) -> dict[str, Any]:
         """Return the numbers of registering these touches; metres and radians."""
         given = self._given
         points = KnownPoints(free=given.points.free, known=self._touches[kept])
@@ -181,7 +188,7 @@ class RealCase:
         best = found.object_from_world[:1]
         numbers = {"best_cost": float(found.cost[0]), **self._counts(kept, best[0])}
         if (truth := self._source.world_from_object) is not None:
-            errors = pose_errors(best, truth, self._symmetry)
+            errors = pose_errors(best, truth, symmetry=self._symmetry)
             position, rotation = (float(error[0]) for error in errors)
             numbers |= {"position_error": position, "rotation_error": rotation}
             numbers["right"] = position <= _RIGHT[0] and rotation <= _RIGHT[1]

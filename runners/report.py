@@ -30,7 +30,7 @@ class ReportConfig:
     out: str | None
 
     def __post_init__(self) -> None:
-        require_choice("format", self.format, FORMATS)
+        require_choice("format", self.format, accepted=FORMATS)
         if not self.dir:
             raise SettingError("dir is missing; pass the folder of an evaluation")
 
@@ -38,10 +38,12 @@ class ReportConfig:
 @command("report")
 def main(config: DictConfig) -> None:
     """Draw all figures, and write the page, the Markdown, the pictures and their data."""
-    checked = build_settings(ReportConfig, plain(config), "report")
-    folder, kind = Path(checked.dir or "").expanduser(), checked.format
+    checked = build_settings(ReportConfig, plain(config), where="report")
+    folder = Path(checked.dir or "").expanduser()
+    kind = checked.format
     out = Path(checked.out).expanduser() if checked.out else folder / "report"
-    evaluation, console = open_evaluation(folder), Console()
+    evaluation = open_evaluation(folder)
+    console = Console()
     files: list[Path] = []
     contents: dict[str, bytes] = {}
     with drawing():
@@ -50,13 +52,13 @@ def main(config: DictConfig) -> None:
         printed = sections[1:] if steered else [s for s in sections if s.title == BASELINE]
         for picture in (section.picture for section in sections if section.picture):
             picture.figure.suptitle(evaluation.experiment["name"])
-            files += write_picture(picture, out, kind)
+            files += write_picture(picture, out, kind=kind)
             if kind != "pdf":  # which pages cannot show
                 contents[files[-2].name] = files[-2].read_bytes()
     given = {"baseline": checked.baseline, "format": None if kind == FORMATS[0] else kind}
     settings = [f"{name}={value}" for name, value in given.items() if value]
     made = shlex.join(["python", "-m", "runners.report", str(checked.dir), *settings])
-    markdown = as_markdown(evaluation, sections, made, kind)
+    markdown = as_markdown(evaluation, sections, command=made, kind=kind)
     texts = {"report.md": markdown, "report.html": as_html(markdown, contents)}
     for name, text in texts.items():
         with whole_file(out / name) as beside:

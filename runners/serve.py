@@ -37,8 +37,10 @@ class ServeConfig:
 @command("serve")
 def main(config: DictConfig) -> None:
     """Compile the kernels, listen, and answer until Ctrl-C or SIGTERM."""
-    checked, console = build_settings(ServeConfig, plain(config), "serve"), Console(soft_wrap=True)
-    given, folder = os.environ.get("CHSEL_TOKEN"), Path(checked.folder).expanduser()
+    checked = build_settings(ServeConfig, plain(config), where="serve")
+    console = Console(soft_wrap=True)
+    given = os.environ.get("CHSEL_TOKEN")
+    folder = Path(checked.folder).expanduser()
     token = given or secrets.token_urlsafe()
     set_threads(checked.threads)
     try:

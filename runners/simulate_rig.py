@@ -40,7 +40,7 @@ class SimulateRigConfig:
 
     def __post_init__(self) -> None:
         StreamKey(self.seed, 0)
-        require_choice("configuration", self.configuration, CABINET_CONFIGURATIONS)
+        require_choice("configuration", self.configuration, accepted=CABINET_CONFIGURATIONS)
         if not self.out or Path(self.out).suffix != ".mcap":
             raise SettingError(f"out is {self.out}; accepted: the name of a file, out=FILE.mcap")
 
@@ -50,14 +50,14 @@ def main(config: DictConfig) -> None:
     """Write a log and the truth beside it, and say what is in it."""
     values = plain(config)
     own = {name: values.pop(name) for name in SimulateRigConfig.__dataclass_fields__}
-    checked = build_settings(SimulateRigConfig, own, "simulate_rig")
-    settings = build_settings(RobotSettings, values, "simulate_rig")
+    checked = build_settings(SimulateRigConfig, own, where="simulate_rig")
+    settings = build_settings(RobotSettings, values, where="simulate_rig")
     name, seed = checked.configuration, checked.seed
     configuration = CABINET_CONFIGURATIONS[name]
     chosen = checked.object
     if "kind" not in chosen:  # our own model of the configuration's object
         chosen = {"name": configuration.object, "epsilon": EPSILON, **chosen, "configuration": name}
-    model = load_object(build_settings(ObjectConfig, chosen, "object"), checked.assets.folder)
+    model = load_object(build_settings(ObjectConfig, chosen, where="object"), checked.assets.folder)
     log = Path(checked.out or "").expanduser()
     truth = log.with_suffix(".truth.yaml")
     for path in (log, truth):
@@ -70,9 +70,11 @@ def main(config: DictConfig) -> None:
         place = f"y {push.y:+.3f} z {push.z:.3f} m  pushed {push.reach:.3f} m"
         console.print(f"probe {push.step:>3}  {place}  {_STOPS[push.stopped]}")
 
-    made = simulate_log(log, configuration, model.mesh, seed, settings, on_push)
+    made = simulate_log(
+        log, configuration, mesh=model.mesh, seed=seed, settings=settings, on_push=on_push
+    )
     about = {"configuration": name, "object": model.name, "scale": model.scale, "seed": seed}
-    write_pose(truth, made.world_from_object, about, overwrite=True)
+    write_pose(truth, made.world_from_object, about=about, overwrite=True)
     console.print(str(log), soft_wrap=True)
     console.print(str(truth), soft_wrap=True)
     console.print("  the true pose")

@@ -74,7 +74,8 @@ def _may_import(module, end):
         return True
     if not place or place[0] not in folders:  # a file of the package itself
         return not place or place[0] not in lowest
-    folder, of_folder = place[0], "".join(end[1:2])
+    folder = place[0]
+    of_folder = "".join(end[1:2])
     if of_folder not in folders:
         return of_folder in folders[folder]  # a file of the package itself that its row names
     if of_folder != folder:

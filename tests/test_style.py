@@ -30,7 +30,8 @@ def names_in(nodes):
 
 def faults(source, ours=()):
     """Lines of a source with what is wrong there; ours: functions and classes of the packages."""
-    found, tree = [], ast.parse(source)
+    found = []
+    tree = ast.parse(source)
     nodes = list(ast.walk(tree))
     functions = [n for n in nodes if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)]
     for function in functions:

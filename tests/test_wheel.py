@@ -110,7 +110,7 @@ def test_the_sdist_has_the_checkout_without_its_tests(built):
     assert not {name for name in names if name.startswith("tests")}
 
 
-def installed(archive, version, folder):
+def installed(archive, version, *, folder):
     """The scripts of an installation in an environment of its own, and how to run them."""
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
     pythons = [*pyenv.glob(f"versions/{version}.*/bin/python"), shutil.which(f"python{version}")]
@@ -136,7 +136,7 @@ def installed(archive, version, folder):
 @pytest.mark.parametrize("version", VERSIONS)
 def test_an_installation_registers_in_any_folder_as_here(version, archive, built, tmp_path):
     """To the bit: a stored recording, registered again by the installed package."""
-    path, options = installed(built[archive], version, tmp_path)
+    path, options = installed(built[archive], version, folder=tmp_path)
     box = trimesh.creation.box((0.1, 0.06, 0.2))
     box.export(tmp_path / "elsewhere" / "box.stl")
     np.savez(tmp_path / "elsewhere" / "points.npz", surface=box.vertices[:6])
@@ -158,7 +158,7 @@ def test_an_installation_registers_in_any_folder_as_here(version, archive, built
 def test_an_extra_alone_does_what_it_is_for(version, extra, built, tmp_path):
     if extra == "sim" and version != "3.11":
         pytest.skip("PyBullet has wheels for Python 3.11 alone")
-    _, options = installed(f"{built['wheel']}[{extra}]", version, tmp_path)
+    _, options = installed(f"{built['wheel']}[{extra}]", version, folder=tmp_path)
     folder = options["cwd"]
     box = trimesh.creation.box((0.1, 0.06, 0.2))
     box.export(folder / "box.stl")

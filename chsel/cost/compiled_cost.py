@@ -39,19 +39,25 @@ class CompiledCost:
         self,
         sdf: SdfGrid,
         points: KnownPoints,
-        settings: CostSettings | None = None,
         *,
+        settings: CostSettings | None = None,
         free_resolution: float = 0.01,
         culling: str = "octree",
     ) -> None:
         require_ieee_arithmetic()
-        require_choice("culling", culling, CULLINGS)
+        require_choice("culling", culling, accepted=CULLINGS)
         require_parts(sdf=sdf, points=points)
         settings = (settings or CostSettings()).of_object(sdf, free_resolution)
         self.settings = settings
         self.model = Model(
-            field=distance_field(sdf, settings.lookup, settings.outside),
-            free=_free_term(sdf, points.free, settings, free_resolution, culling),
+            field=distance_field(sdf, settings.lookup, outside=settings.outside),
+            free=_free_term(
+                sdf,
+                points.free,
+                settings=settings,
+                free_resolution=free_resolution,
+                culling=culling,
+            ),
             occupied=points.occupied.T.copy(),
             known=points.known.T.copy(),
             known_sdf=points.sdf.copy(),
@@ -67,14 +73,14 @@ class CompiledCost:
     def of(cls, problem: RegistrationProblem, settings: CostSettings | None = None) -> CompiledCost:
         """Return the cost that a problem's points define."""
         resolution = problem.free_resolution
-        return cls(problem.sdf, problem.points, settings, free_resolution=resolution)
+        return cls(problem.sdf, problem.points, settings=settings, free_resolution=resolution)
 
     def at_level(self, sdf: SdfGrid, level: float) -> Model:
         """Return the model of direct free points with another penetration tolerance."""
         lookup = self.settings.lookup
-        centre, radius = _sphere_around_cells(sdf, level, lookup)
+        centre, radius = _sphere_around_cells(sdf, level, lookup=lookup)
         free = self.model.free._replace(
-            cells=cells_below(sdf, level, lookup),
+            cells=cells_below(sdf, level, lookup=lookup),
             centre=centre,
             radius=radius,
         )
@@ -87,16 +93,14 @@ class CompiledCost:
     def costs(self, poses: Poses) -> FloatArray:
         """Return costs (B,) of poses."""
         costs = np.empty(len(poses))
-        run, work = (
-            partial(costs_of_poses, self.model, poses.numbers, costs),
-            partial(work_of, self.model),
-        )
-        parallel_for(run, len(poses), work, least=_POSES_PER_THREAD, multiple=LANES)
+        run = partial(costs_of_poses, self.model, poses.numbers, costs)
+        work = partial(work_of, self.model)
+        parallel_for(run, len(poses), scratch=work, least=_POSES_PER_THREAD, multiple=LANES)
         return costs
 
 
 def _free_term(
-    sdf: SdfGrid, free: FloatArray, settings: CostSettings, free_resolution: float, culling: str
+    sdf: SdfGrid, free: FloatArray, *, settings: CostSettings, free_resolution: float, culling: str
 ) -> FreeTerm:
     is_interior = settings.free_term == "interior" and len(free) > 0
     if is_interior:
@@ -110,15 +114,18 @@ def _free_term(
         weights = interior.weights(settings, free_resolution)[:, None]
         weights = np.concatenate([weights, -weights * interior.normals], axis=1).reshape(-1)
         voxels = VoxelGrid.around(free, free_resolution)
-        box = box_of(voxels.origin, free_resolution, voxels.flags.shape)
+        box = box_of(voxels.origin, free_resolution, shape=voxels.flags.shape)
         cells = cell_set_of(box, voxels.flags)
         centre, radius = _sphere_around(interior.points, 0.0)
         lower, upper = box.first, box.last
     else:
-        alpha, lookup, weights = settings.alpha, settings.lookup, np.zeros(0)
-        tree, cells = point_tree(free, free_resolution), cells_below(sdf, alpha, lookup)
-        centre, radius = _sphere_around_cells(sdf, alpha, lookup)
-        warn_if_too_deep(sdf, free, alpha)
+        alpha = settings.alpha
+        lookup = settings.lookup
+        weights = np.zeros(0)
+        tree = point_tree(free, free_resolution)
+        cells = cells_below(sdf, alpha, lookup=lookup)
+        centre, radius = _sphere_around_cells(sdf, alpha, lookup=lookup)
+        warn_if_too_deep(sdf, free, alpha=alpha)
         lower, upper = (triple(corner) for corner in bounds_of(free)) if len(free) else _NO_BOX
     return FreeTerm(
         interior=is_interior,
@@ -133,11 +140,11 @@ def _free_term(
     )
 
 
-def _sphere_around_cells(sdf: SdfGrid, level: float, lookup: str) -> tuple[Triple, float]:
+def _sphere_around_cells(sdf: SdfGrid, level: float, *, lookup: str) -> tuple[Triple, float]:
     """Return centre and radius of a sphere around the cells that read any value below `level`."""
 
     def make() -> tuple[Triple, float]:
-        box = cells_below(sdf, level, lookup).box
+        box = cells_below(sdf, level, lookup=lookup).box
         cells = np.argwhere(sdf.active_cells(level, lookup))
         if len(cells) == 0:
             return (0.0, 0.0, 0.0), 0.0
@@ -149,7 +156,8 @@ def _sphere_around_cells(sdf: SdfGrid, level: float, lookup: str) -> tuple[Tripl
 
 def _sphere_around(points: FloatArray, margin: float) -> tuple[Triple, float]:
     """Return centre and radius of a sphere around boxes of half-side `margin` at points (N, 3)."""
-    lower, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
+    lower = points.min(axis=0) - margin
+    upper = points.max(axis=0) + margin
     half = (upper - lower) / 2.0
     radius = float(np.sqrt((half**2).sum())) * (1.0 + 1e-9) + 1e-9
     return triple((lower + upper) / 2.0), radius

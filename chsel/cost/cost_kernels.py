@@ -151,7 +151,9 @@ def _add_known(model, lanes):
 
 @inner
 def _add_violations(model, lanes, x, y, z):
-    scale, alpha, exact = model.occupied_scale, model.alpha, model.exact_gradient
+    scale = model.occupied_scale
+    alpha = model.alpha
+    exact = model.exact_gradient
     for at in range(LANES):
         violation = max(alpha + lanes[_READ + at], 0.0)
         size = scale * slope(exact, violation)
@@ -161,7 +163,9 @@ def _add_violations(model, lanes, x, y, z):
 
 @inner
 def _add_differences(model, lanes, known_sdf, x, y, z):
-    scale, tolerance, exact = model.known_scale, model.known_tolerance, model.exact_gradient
+    scale = model.known_scale
+    tolerance = model.known_tolerance
+    exact = model.exact_gradient
     for at in range(LANES):
         difference = lanes[_READ + at] - known_sdf
         excess = max(abs(difference) - tolerance, 0.0)
@@ -216,7 +220,10 @@ def _read(field, lanes, x, y, z):
 
 @leaf
 def _locate(box, lanes, x, y, z):
-    first, last, most, inverse = box.first, box.last, box.most, box.inverse
+    first = box.first
+    last = box.last
+    most = box.most
+    inverse = box.inverse
     for at in range(LANES):
         a = lanes[at] * x + lanes[LANES + at] * y + lanes[2 * LANES + at] * z
         b = lanes[3 * LANES + at] * x + lanes[4 * LANES + at] * y + lanes[5 * LANES + at] * z

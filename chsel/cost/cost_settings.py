@@ -86,7 +86,7 @@ def uncertain_depth(sdf: SdfGrid, depth: float) -> float:
     return min(depth, 0.5 * max(-float(sdf.values.min()), 0.0))
 
 
-def warn_if_too_deep(sdf: SdfGrid, free: FloatArray, alpha: float) -> None:
+def warn_if_too_deep(sdf: SdfGrid, free: FloatArray, *, alpha: float) -> None:
     """Warn if there are free points, and nothing of the object is as deep as they may be."""
     if len(free) and not (sdf.values < alpha).any():
         text = f"no node of the SDF is deeper than {-alpha} m: free points cannot be violated; "
@@ -104,8 +104,10 @@ class InteriorPoints:
 
     def in_order(self, order: IntArray) -> InteriorPoints:
         """Return the points in an order (M,) of their indices."""
-        points, depth, normals = self.points[order], self.depth[order], self.normals[order]
-        return InteriorPoints(points, depth, normals, self.spacing)
+        points = self.points[order]
+        depth = self.depth[order]
+        normals = self.normals[order]
+        return InteriorPoints(points, depth, normals=normals, spacing=self.spacing)
 
     def weights(self, settings: CostSettings, free_resolution: float) -> FloatArray:
         """Return the costs (M,) of points in a free voxel."""
@@ -140,4 +142,4 @@ def interior_points(sdf: SdfGrid, settings: CostSettings) -> InteriorPoints:
             f"than {spacing} m describes the object better",
             stacklevel=3,
         )
-    return InteriorPoints(nodes[inside], -s[inside], n[inside], spacing)
+    return InteriorPoints(nodes[inside], -s[inside], normals=n[inside], spacing=spacing)

@@ -77,7 +77,9 @@ def neighbours_of(free: FreeTerm, poses: int) -> Neighbours:
     slack = scratch(poses)
     slack[:] = -1.0
     gathered, last = scratch(poses, 12), scratch(poses, 12)
-    return Neighbours(near_points_for(free.tree, poses), slack, gathered, last, scratch(_SIZE))
+    return Neighbours(
+        near_points_for(free.tree, poses), slack, gathered=gathered, last=last, block=scratch(_SIZE)
+    )
 
 
 @leaf
@@ -223,7 +225,10 @@ def _put(block, first, n, four):
 @inner
 def _locate(move, box, level, block, count):
     """Fill the rows of a block with the places of moved points."""
-    first, last, most, inverse = box.first, box.last, box.most, box.inverse
+    first = box.first
+    last = box.last
+    most = box.most
+    inverse = box.inverse
     for n in range(count):
         x, y, z = block[_POINT + n], block[_POINT + _MOST + n], block[_POINT + 2 * _MOST + n]
         a = move[0] * x + move[1] * y + move[2] * z + move[9]

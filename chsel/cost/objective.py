@@ -143,25 +143,30 @@ class Objective:
 
     def costs_and_gradients(self, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return costs (B,) and the defined gradients (B, d) at vectors (B, d)."""
-        costs, gradients = np.empty(len(vectors)), np.empty(vectors.shape)
+        costs = np.empty(len(vectors))
+        gradients = np.empty(vectors.shape)
         space = self.space_arrays
         run = partial(costs_and_gradients, self.model, space, vectors, costs, gradients)
-        parallel_for(run, len(vectors), self.work, multiple=LANES)
+        parallel_for(run, len(vectors), scratch=self.work, multiple=LANES)
         return costs, gradients
 
     def descended(
-        self, vectors: FloatArray, divisor: float, rate: float, iterations: int
+        self, vectors: FloatArray, divisor: float, *, rate: float, iterations: int
     ) -> FloatArray:
         """Return vectors (B, d) after iterations of Adam; gradients are divided by `divisor`."""
-        return self._descended(vectors, divisor, rate, iterations, ends_on_poses=False)[0]
+        return self._descended(
+            vectors, divisor, rate=rate, iterations=iterations, ends_on_poses=False
+        )[0]
 
     def block(
-        self, vectors: FloatArray, divisor: float, rate: float, iterations: int
+        self, vectors: FloatArray, divisor: float, *, rate: float, iterations: int
     ) -> tuple[FloatArray, FloatArray]:
         """Return vectors (B, d) of poses after a block of iterations, and costs (B,)."""
         if not self.space_arrays.planar:
-            return self._descended(vectors, divisor, rate, iterations, ends_on_poses=True)
-        moved = self.descended(vectors, divisor, rate, iterations)
+            return self._descended(
+                vectors, divisor, rate=rate, iterations=iterations, ends_on_poses=True
+            )
+        moved = self.descended(vectors, divisor, rate=rate, iterations=iterations)
         moved = self.space.encode(self.space.poses(moved))
         return moved, self.costs(moved)
 
@@ -169,13 +174,23 @@ class Objective:
         self,
         vectors: FloatArray,
         divisor: float,
+        *,
         rate: float,
         iterations: int,
-        *,
         ends_on_poses: bool,
     ) -> tuple[FloatArray, FloatArray]:
-        moved, costs = vectors.copy(), np.empty(len(vectors))
-        adam = iterations, float(rate), float(divisor), ends_on_poses
-        run = partial(descend, self.model, self.space_arrays, moved, costs, *adam)
-        parallel_for(run, len(vectors), self.work, multiple=LANES)
+        moved = vectors.copy()
+        costs = np.empty(len(vectors))
+        run = partial(
+            descend,
+            self.model,
+            self.space_arrays,
+            moved,
+            costs,
+            iterations,
+            float(rate),
+            float(divisor),
+            ends_on_poses,
+        )
+        parallel_for(run, len(vectors), scratch=self.work, multiple=LANES)
         return moved, costs

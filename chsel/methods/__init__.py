@@ -50,7 +50,7 @@ def _lacks(method: Any) -> str | None:
 
 
 _CHOICES = NamedChoices[Method](
-    "method", "chsel.methods", "docs/writing_a_method.md", _OURS, _lacks
+    "method", "chsel.methods", page="docs/writing_a_method.md", ours=_OURS, lacks=_lacks
 )
 METHODS = _CHOICES.names
 build_method, preset_settings = _CHOICES.build, _CHOICES.settings
@@ -58,7 +58,7 @@ build_method, preset_settings = _CHOICES.build, _CHOICES.settings
 
 def default_method(preset: str = "default") -> str:
     """Return the method for a program's points; in the paper's presets the paper's method."""
-    require_choice("preset", preset, PRESETS)
+    require_choice("preset", preset, accepted=PRESETS)
     return "anchored" if preset == "default" else "chsel"
 
 
@@ -70,7 +70,10 @@ def method_settings(method: str, preset: str, *changes: Any) -> Any:
             chosen = change
         elif change is not None:
             require_instance(
-                "settings", change, Mapping, "a mapping, or the settings of the method"
+                "settings",
+                change,
+                kind=Mapping,
+                accepted="a mapping, or the settings of the method",
             )
-            chosen = changed_settings(chosen, change, f"method={method}: settings")
+            chosen = changed_settings(chosen, change, where=f"method={method}: settings")
     return chosen

@@ -77,7 +77,7 @@ class AnchoredStarts(CheckedSettings):
 
 
 def anchored_starts(
-    problem: RegistrationProblem, space: SearchSpace, settings: AnchoredStarts, index: int
+    problem: RegistrationProblem, space: SearchSpace, *, settings: AnchoredStarts, index: int
 ) -> Poses:
     """Return K poses, best first; none of an object too thin to have a surface on its grid.
 
@@ -86,7 +86,7 @@ def anchored_starts(
     if not has_surface(problem.sdf):
         return Poses(np.zeros((0, 12)))
     known = most_informative_first(problem.points)
-    sampler = AnchorSampler(problem, known, space, settings.anchors)
+    sampler = AnchorSampler(problem, known, space=space, settings=settings.anchors)
     return sampler.best(settings.samples, settings.kept, index=index)
 
 
@@ -107,18 +107,22 @@ class AnchorSampler:
         self,
         problem: RegistrationProblem,
         known: KnownPoints,
+        *,
         space: SearchSpace,
         settings: AnchorSettings,
     ) -> None:
         """known: the problem's points, see most_informative_first."""
-        self._problem, self._known, self._space, self._settings = problem, known, space, settings
+        self._problem = problem
+        self._known = known
+        self._space = space
+        self._settings = settings
         lower, upper = problem.workspace.bounds
         middle = 0.5 * (lower + upper)
         if len(known.known):  # the median of contacts, so that 32 bits are enough around it
             median = np.sort(known.known, axis=0)[len(known.known) // 2]
             middle = np.minimum(np.maximum(median, lower), upper)
         self._middle = middle
-        lower, upper = origin_bounds(problem.workspace, space, settings.margin)
+        lower, upper = origin_bounds(problem.workspace, space, margin=settings.margin)
         inset = _ROUNDING * (1.0 + np.abs([lower - middle, upper - middle]).max(axis=0))
         inset = np.minimum(inset, 0.25 * (upper - lower))
         self._lower = _in_32_bits(lower + inset - middle)
@@ -128,26 +132,32 @@ class AnchorSampler:
 
     def _set_anchors(self) -> None:
         """Take contacts, and the surface points that can be put onto them."""
-        sdf, known, middle, space = self._problem.sdf, self._known, self._middle, self._space
+        sdf = self._problem.sdf
+        known = self._known
+        middle = self._middle
+        space = self._space
         surface, normals, lengths, pairs = sdf.derived("surface pairs", lambda: _surface_pairs(sdf))
         contacts, values = known.known[:_MOST_ANCHORS], known.sdf[:_MOST_ANCHORS]
-        order, contact_pairs = np.arange(len(surface)), np.zeros((0, 2), dtype=np.int64)
+        order = np.arange(len(surface))
+        contact_pairs = np.zeros((0, 2), dtype=np.int64)
         if isinstance(space, SE2Space):
             heights = (surface * space.axis).sum(axis=1)
             order = np.argsort(heights, kind="stable")
             wanted = (contacts * space.upward).sum(axis=1) + space.offset
-            spans = _spans(heights[order], wanted, _LENGTHS_ALIKE + np.abs(values))
+            spans = _spans(heights[order], wanted, reach=_LENGTHS_ALIKE + np.abs(values))
             pair_spans = contact_pairs
         else:
             spans = np.tile([0, len(surface)], (len(contacts), 1))
-            contact_pairs, pair_spans = _pairs_of_contacts(contacts, values, lengths)
+            contact_pairs, pair_spans = _pairs_of_contacts(contacts, values, lengths=lengths)
         met = spans[:, 1] > 0
         self._surface, self._normals = _in_32_bits(surface.T), _in_32_bits(normals.T)  # (3, Q)
         self._surface_pairs = pairs  # (2 P,), of indices, by their lengths
         self._surface_order = order  # (Q,), by heights over a plane
         self._contacts = _in_32_bits((contacts[met] - middle).T)  # (3, C)
         self._values = _in_32_bits(values[met])
-        self._contact_spans, self._pair_spans = spans[met].T.copy(), pair_spans.T.copy()  # (2, ...)
+        # (2, ...)
+        self._contact_spans = spans[met].T.copy()
+        self._pair_spans = pair_spans.T.copy()
         self._frames = _in_32_bits(_frames(contacts[contact_pairs] - middle).T)  # (12, pairs)
 
     def best(
@@ -162,25 +172,36 @@ class AnchorSampler:
         half of a voxel, as voxels are coarse. left_out: 1 for scores without the contact that costs
         a pose the most, as it may be a contact with another object; else 0.
         """
-        score, settings = self._coarse_score(tolerance, left_out), self._settings
+        score = self._coarse_score(tolerance, left_out)
+        settings = self._settings
         pairs = round(settings.pairs * samples) if self._frames.size else 0
         anchored = round((settings.pairs + settings.contacts) * samples)
         ends = np.array([pairs, anchored if self._values.size else pairs])
         stream = self._problem.key.stream(Purpose.ANCHORS, index)
-        keys, poses = np.zeros(0, dtype=np.int64), dict[int, Any]()
+        keys = np.zeros(0, dtype=np.int64)
+        poses = dict[int, Any]()
         for first in range(0, samples, _DRAWN_AT_ONCE):
             count = min(_DRAWN_AT_ONCE, samples - first)
             shares = stream.random((_SHARES, count), dtype=np.float32)
-            keys = self._best_keys(score, shares, first, ends, keys, min(most, samples))
+            keys = self._best_keys(
+                score, shares, first=first, ends=ends, keys=keys, most=min(most, samples)
+            )
             numbers = keys % 2**32
             new = np.sort(numbers[numbers >= first])
-            placed = self._placed(shares[:, new - first], new, ends)
+            placed = self._placed(shares[:, new - first], new, ends=ends)
             poses.update(zip(new.tolist(), placed, strict=True))
         chosen = [poses[number] for number in (keys % 2**32).tolist()]
         return self._exact(np.array(chosen, dtype=np.float64).reshape(-1, 12))
 
     def _best_keys(
-        self, score: CoarseScore, shares: Any, first: int, ends: IntArray, keys: IntArray, most: int
+        self,
+        score: CoarseScore,
+        shares: Any,
+        *,
+        first: int,
+        ends: IntArray,
+        keys: IntArray,
+        most: int,
     ) -> IntArray:
         """Return the best keys, ascending, of those before and of poses from `first` on."""
         heaps: list[IntArray] = []
@@ -195,13 +216,15 @@ class AnchorSampler:
             for at in range(start, stop, _PLACED_AT_ONCE):
                 part = slice(at, min(at + _PLACED_AT_ONCE, stop))
                 numbers = np.arange(first + part.start, first + part.stop)
-                keep_best(score, self._placed(shares[:, part], numbers, ends), first + at, heap)
+                keep_best(
+                    score, self._placed(shares[:, part], numbers, ends=ends), first + at, heap
+                )
 
-        parallel_for(run, shares.shape[1], scratch, least=_SAMPLES_PER_THREAD)
+        parallel_for(run, shares.shape[1], scratch=scratch, least=_SAMPLES_PER_THREAD)
         merged = np.unique(np.concatenate(heaps))
         return merged[merged < NO_POSE][:most]
 
-    def _placed(self, shares: Any, numbers: IntArray, ends: IntArray) -> Any:
+    def _placed(self, shares: Any, numbers: IntArray, *, ends: IntArray) -> Any:
         """Return poses (N, 12) from their shares (_SHARES, N) and numbers (N,), which ascend."""
         pairs, singles, others = np.split(shares, np.searchsorted(numbers, ends), axis=1)
         parts = self._on_pairs(pairs), self._on_contacts(singles), self._anywhere(others)
@@ -214,7 +237,8 @@ class AnchorSampler:
         """
         pair = _chosen(shares[0], self._pair_spans.shape[1])
         first, count = self._pair_spans.take(pair, axis=1)
-        at, flip = 2 * (first + _chosen(shares[1], count)), shares[2] < _HALF
+        at = 2 * (first + _chosen(shares[1], count))
+        flip = shares[2] < _HALF
         p = self._surface.take(self._surface_pairs.take(at + flip), axis=1)
         q = self._surface.take(self._surface_pairs.take(at + ~flip), axis=1)
         x, y, z = along = _unit(q - p)
@@ -225,7 +249,7 @@ class AnchorSampler:
         turned = np.array([along, cosine * across + sine * other, cosine * other - sine * across])
         frame = self._frames.take(pair, axis=1)
         rotation = product(turned.T, frame[:9].reshape(3, 3, -1).transpose(2, 0, 1))
-        return self._poses(rotation, frame[9:], _HALF * (p + q))
+        return self._poses(rotation, frame[9:], onto=_HALF * (p + q))
 
     def _on_contacts(self, shares: Any) -> Any:
         """Return poses that put a surface point onto a contact, or one at its distance."""
@@ -234,12 +258,12 @@ class AnchorSampler:
         at = self._surface_order[first + _chosen(shares[1], count)]
         outward = self._values[contact] * self._normals.take(at, axis=1)
         met = self._surface.take(at, axis=1) + outward
-        return self._poses(self._rotations(shares), self._contacts.take(contact, axis=1), met)
+        return self._poses(self._rotations(shares), self._contacts.take(contact, axis=1), onto=met)
 
     def _anywhere(self, shares: Any) -> Any:
         """Return poses that put the object's origin anywhere in its bounds."""
         origins = self._lower[:, None] + shares[:3] * (self._upper - self._lower)[:, None]
-        return self._poses(self._rotations(shares), origins, np.zeros_like(origins))
+        return self._poses(self._rotations(shares), origins, onto=np.zeros_like(origins))
 
     def _rotations(self, shares: Any) -> Any:
         """Return rotations (N, 3, 3) about the plane's axis, or uniform (Shoemake, 1992)."""
@@ -251,10 +275,11 @@ class AnchorSampler:
             rotations = resting + s * turning + (1 - c) * squared
             return rotations.reshape(3, 3, -1).transpose(2, 0, 1)
         sine, cosine = sines_cosines_of_turns(shares[4])
-        small, large = np.sqrt(1 - shares[5]), np.sqrt(shares[5])
+        small = np.sqrt(1 - shares[5])
+        large = np.sqrt(shares[5])
         return rotation_matrices(np.array([small * c, large * sine, large * cosine, small * s]).T)
 
-    def _poses(self, rotation: Any, points: Any, onto: Any) -> Any:
+    def _poses(self, rotation: Any, points: Any, *, onto: Any) -> Any:
         """Return poses (12, N) that move points (3, N) onto points of the object: t = q - R p."""
         shift = onto - rotated(rotation, points.T).T
         space = self._space
@@ -274,7 +299,9 @@ class AnchorSampler:
         return self._space.poses(self._space.encode(poses))
 
     def _coarse_score(self, tolerance: float, left_out: int) -> CoarseScore:
-        sdf, known, (first, is_free) = self._problem.sdf, self._known, self._free
+        sdf = self._problem.sdf
+        known = self._known
+        (first, is_free) = self._free
         side = self._problem.free_resolution
         tolerance = max(tolerance, uncertain_depth(sdf, 0.5 * side))
         inside, costs = sdf.derived(("inside", tolerance), lambda: _inside(sdf, tolerance))
@@ -285,7 +312,7 @@ class AnchorSampler:
         return CoarseScore(
             lower=self._lower,
             upper=self._upper,
-            grid=_box(sdf.origin, sdf.resolution, sdf.shape),
+            grid=_box(sdf.origin, sdf.resolution, shape=sdf.shape),
             values=sdf.derived("coarse values", lambda: _in_units(sdf.values)),
             contacts=_in_32_bits(contacts - self._middle).T.copy(),
             known_sdf=_in_32_bits(known.sdf[:_MOST_CONTACTS] / UNIT),
@@ -293,7 +320,7 @@ class AnchorSampler:
             left_out=left_out,
             inside=_in_32_bits(inside),
             weights=np.rint(np.minimum(costs, _MOST_COST / max(len(costs), 1))).astype(np.int32),
-            voxels=_box(first - self._middle, side, is_free.shape),
+            voxels=_box(first - self._middle, side, shape=is_free.shape),
             is_free=is_free.reshape(-1),
         )
 
@@ -318,12 +345,15 @@ def _in_units(metres: FloatArray) -> Any:
     return np.clip(np.rint(metres / UNIT), -32767, 32767).astype(np.int16).reshape(-1)
 
 
-def _box(first: FloatArray, resolution: float, shape: Sequence[int]) -> Box32:
+def _box(first: FloatArray, resolution: float, *, shape: Sequence[int]) -> Box32:
     """Return the box of a grid of nodes (nx, ny, nz) whose first node is at `first` (3,)."""
     x, y, z = _in_32_bits(first)
     a, b, c = (np.float32(count - 1) for count in shape)
-    inverse, (_, along, last) = np.float32(1.0 / resolution), shape
-    return Box32((x, y, z), inverse, (a, b, c), np.int32(along * last), np.int32(last))
+    inverse = np.float32(1.0 / resolution)
+    (_, along, last) = shape
+    return Box32(
+        (x, y, z), inverse, most=(a, b, c), across=np.int32(along * last), along=np.int32(last)
+    )
 
 
 def _inside(sdf: SdfGrid, tolerance: float) -> tuple[FloatArray, FloatArray]:
@@ -341,12 +371,14 @@ def _inside(sdf: SdfGrid, tolerance: float) -> tuple[FloatArray, FloatArray]:
 
 def _free_voxels(problem: RegistrationProblem, reach: float) -> tuple[FloatArray, Any]:
     """Return the centre (3,) of the first voxel, and flags (nx, ny, nz) of free voxels."""
-    free, side = problem.points.free, problem.free_resolution
+    free = problem.points.free
+    side = problem.free_resolution
     lower, upper = problem.workspace.bounds
     free = free[((free >= lower - reach) & (free <= upper + reach)).all(axis=1)]
     if len(free):
         bounds = bounds_of(free)
-        first, counts = bounds[0] - side, np.rint((bounds[1] - bounds[0]) / side) + 3.0
+        first = bounds[0] - side
+        counts = np.rint((bounds[1] - bounds[0]) / side) + 3.0
         if math.prod(counts.tolist()) < _MOST_VOXELS:
             is_free = np.zeros(counts.astype(np.int64) + 1, dtype=np.bool_)
             set_voxels(free, first, side, is_free)  # the first is (1, 1, 1) to it
@@ -368,7 +400,7 @@ def _frames(pairs: FloatArray) -> FloatArray:
 def _surface_pairs(sdf: SdfGrid) -> tuple[FloatArray, FloatArray, FloatArray, Any]:
     """Return surface points and normals (Q, 3), pairs (2 P,) of them, and their lengths (P,)."""
     stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
-    surface = surface_points(sdf, _SURFACE_POINTS, stream)
+    surface = surface_points(sdf, _SURFACE_POINTS, stream=stream)
     normals = sdf.at(surface, lookup="trilinear")[1]
     normals = normals / np.maximum(np.sqrt((normals**2).sum(axis=1, keepdims=True)), 1e-12)
     i, j = np.triu_indices(len(surface), 1)
@@ -379,18 +411,18 @@ def _surface_pairs(sdf: SdfGrid) -> tuple[FloatArray, FloatArray, FloatArray, An
 
 
 def _pairs_of_contacts(
-    contacts: FloatArray, values: FloatArray, lengths: FloatArray
+    contacts: FloatArray, values: FloatArray, *, lengths: FloatArray
 ) -> tuple[IntArray, IntArray]:
     """Return pairs of contacts (C, 2), and the spans (C, 2) of surface pairs of their length."""
     touching = np.flatnonzero(values == 0.0)
     pairs = touching[np.stack(np.triu_indices(len(touching), 1), axis=1)]
     apart = np.sqrt(((contacts[pairs[:, 0]] - contacts[pairs[:, 1]]) ** 2).sum(axis=1))
-    spans = _spans(lengths, apart, _LENGTHS_ALIKE)
+    spans = _spans(lengths, apart, reach=_LENGTHS_ALIKE)
     good = (apart >= _LEAST_LENGTH) & (spans[:, 1] > 0)
     return pairs[good], spans[good]
 
 
-def _spans(ascending: FloatArray, wanted: FloatArray, reach: FloatArray | float) -> IntArray:
+def _spans(ascending: FloatArray, wanted: FloatArray, *, reach: FloatArray | float) -> IntArray:
     """Return first, and how many (N, 2) of the ascending values are near to wanted ones (N,)."""
     first = np.searchsorted(ascending, wanted - reach)
     last = np.searchsorted(ascending, wanted + reach, side="right")
@@ -480,7 +512,9 @@ def _coarse_score(score, pose, nodes, beyond, limit):
         cost = np.int64(min(abs(off), score.reach))
         total, worst = total + cost, max(worst, cost)
     total -= score.left_out * worst
-    voxels, most, inside = score.voxels, score.voxels.most, score.inside
+    voxels = score.voxels
+    most = score.voxels.most
+    inside = score.inside
     to_voxels = _voxels_from_object(voxels, pose)
     for n in range(len(inside)):
         if total > limit:

@@ -75,12 +75,12 @@ class Chsel(ConfiguredMethod[ChselSettings]):
     settings_class = ChselSettings
 
     def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
-        algorithm = _Algorithm1(problem, self.settings, observer)
+        algorithm = _Algorithm1(problem, self.settings, observer=observer)
         initial_set, low_cost_set = Poses.of(problem.initial_set), Poses.of(problem.low_cost_set)
-        hypotheses = algorithm.run(initial_set, low_cost_set, 0)
+        hypotheses = algorithm.run(initial_set, low_cost_set, index=0)
         for index in range(1, self.settings.passes):
             initial_set = algorithm.resampled_around_best(hypotheses, index)
-            hypotheses = algorithm.run(initial_set, Poses.of(hypotheses.elites), index)
+            hypotheses = algorithm.run(initial_set, Poses.of(hypotheses.elites), index=index)
         return hypotheses
 
 
@@ -88,28 +88,41 @@ class _Algorithm1:
     """Algorithm 1 of the paper on one problem. index: of the pass."""
 
     def __init__(
-        self, problem: RegistrationProblem, settings: ChselSettings, observer: Observer
+        self, problem: RegistrationProblem, settings: ChselSettings, *, observer: Observer
     ) -> None:
-        self.problem, self.settings, self.observer = problem, settings, observer
+        self.problem = problem
+        self.settings = settings
+        self.observer = observer
         self.space = search_space(settings.plane, problem.sdf)
         self.objective = Objective(CompiledCost.of(problem, settings.cost), self.space)
         self.measure = measure_named(settings.archive.measure, planar=settings.plane is not None)
 
-    def run(self, initial_set: Poses, low_cost_set: Poses, index: int) -> Hypotheses:
+    def run(self, initial_set: Poses, low_cost_set: Poses, *, index: int) -> Hypotheses:
         """Return hypotheses from E_0 and E_l, line by line."""
-        objective, space, measure = self.objective, self.space, self.measure
-        settings, known_count = self.settings.archive, len(self.problem.points.known)
+        objective = self.objective
+        space = self.space
+        measure = self.measure
+        settings = self.settings.archive
+        known_count = len(self.problem.points.known)
         # 1: E' <- SGD on E_0 with C^
         vectors, costs = self.sgd(initial_set, index)
         # 2: P <- m(E')
-        estimates = evaluated(objective, measure, vectors, costs)
+        estimates = evaluated(objective, measure, vectors=vectors, costs=costs)
         # 3: mu, sigma <- mean and standard deviation of P
         # 4: M <- grid with dimensions mu +- b_sigma sigma
-        archive = sized_archive(estimates, measure, settings, known_count, space.dimension)
+        archive = sized_archive(
+            estimates,
+            measure,
+            settings=settings,
+            known_count=known_count,
+            dimension=space.dimension,
+        )
         # 5: M <- UpdateCells(M, E' and E_l)
-        archive.update_cells(estimates, evaluated(objective, measure, space.encode(low_cost_set)))
+        archive.update_cells(
+            estimates, evaluated(objective, measure, vectors=space.encode(low_cost_set))
+        )
         # 6: M <- CMA-MEGA(M, C^, n_o)
-        self.cma_mega(archive, initial_set, index)
+        self.cma_mega(archive, initial_set, index=index)
         # 7: E <- |E_0| of the cells of M with the lowest costs
         return self.lowest_cost_cells(archive, index)
 
@@ -117,34 +130,57 @@ class _Algorithm1:
         """Return line 1, on further starts too if there are any: vectors (B, d) and costs (B,)."""
         settings, starts = self.settings, initial_set
         if settings.starts is not None:
-            anchored = anchored_starts(self.problem, self.space, settings.starts, index)
+            anchored = anchored_starts(
+                self.problem, self.space, settings=settings.starts, index=index
+            )
             starts = Poses.joined([initial_set, anchored])
-        estimates, costs = descend(self.objective, starts, settings.descent, self.observer)
+        estimates, costs = descend(
+            self.objective, starts, settings=settings.descent, observer=self.observer
+        )
         inside = self.within_workspace(estimates)
         return self.space.encode(estimates[inside]), costs[inside]
 
-    def cma_mega(self, archive: GridArchive, initial_set: Poses, index: int) -> None:
+    def cma_mega(self, archive: GridArchive, initial_set: Poses, *, index: int) -> None:
         """Run line 6, or CMA-ME in its place."""
-        settings, start = self.settings.emitter, archive.best_solution
+        settings = self.settings.emitter
+        start = archive.best_solution
         if settings.start == "initial":
             start = self.space.encode(initial_set[:1])[0]
-        key, count = self.problem.key, len(initial_set)
-        search = self.settings.search, self.objective, archive, start, count, settings
-        fill_archive(*search, key, self.observer, index)
+        key = self.problem.key
+        count = len(initial_set)
+        fill_archive(
+            self.settings.search,
+            self.objective,
+            archive=archive,
+            start=start,
+            count=count,
+            settings=settings,
+            key=key,
+            observer=self.observer,
+            refinement=index,
+        )
 
     def lowest_cost_cells(self, archive: GridArchive, index: int) -> Hypotheses:
         """Return line 7."""
-        problem, space, output = self.problem, self.space, self.settings.output
+        problem = self.problem
+        space = self.space
+        output = self.settings.output
         last = archive.snapshot(self.settings.emitter.iterations, index)
         elites = space.poses(last.solutions)
         stream = problem.key.stream(Purpose.RESAMPLE, index)
-        chosen = select_elites(-last.objectives, elites, problem, space, output, stream)
+        chosen = select_elites(
+            -last.objectives, elites, problem=problem, space=space, settings=output, stream=stream
+        )
         kept = elites[self.within_workspace(elites)]
-        return ranked_hypotheses(self.objective, elites[chosen], last.cells[chosen], kept, last)
+        return ranked_hypotheses(
+            self.objective, elites[chosen], cells=last.cells[chosen], elites=kept, archive=last
+        )
 
     def within_workspace(self, poses: Poses) -> BoolArray:
         """Return True (B,) for the poses to keep."""
-        return within_workspace(poses, self.problem, self.space, self.settings.output.margin)
+        return within_workspace(
+            poses, self.problem, space=self.space, margin=self.settings.output.margin
+        )
 
     def resampled_around_best(self, estimates: Hypotheses, index: int) -> Poses:
         """Return E_0 of a further pass, drawn around the best fifth of B estimates.
@@ -152,7 +188,8 @@ class _Algorithm1:
         By mean and deviation (ddof 1) of each coordinate of the search vectors; the best fifth
         itself comes first, unchanged.
         """
-        count, space = len(estimates.cost), self.space
+        count = len(estimates.cost)
+        space = self.space
         best = np.argsort(estimates.cost, kind="stable")[: max(1, int(_BEST * count))]
         vectors = space.encode(Poses.of(estimates.object_from_world[best]))
         deviation = vectors.std(axis=0, ddof=1) if len(best) > 1 else np.zeros(space.dimension)

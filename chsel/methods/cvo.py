@@ -108,12 +108,21 @@ class Cvo(ConfiguredMethod[CvoSettings]):
     settings_class = CvoSettings
 
     def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
-        settings, estimates = self.settings, Poses.of(problem.initial_set)
-        poses, (lower, upper) = estimates.numbers, problem.workspace.bounds
+        settings = self.settings
+        estimates = Poses.of(problem.initial_set)
+        poses = estimates.numbers
+        (lower, upper) = problem.workspace.bounds
         centre = (lower + upper) / 2.0 if settings.origin == "workspace" else np.zeros(3)
         stop_below = -1.0 if settings.stop_below is None else settings.stop_below
-        steps, most = (settings.min_step, settings.max_step), settings.max_iterations
-        ascent = Ascent(*steps, triple(centre), settings.c, settings.d, stop_below)
+        most = settings.max_iterations
+        ascent = Ascent(
+            settings.min_step,
+            settings.max_step,
+            centre=triple(centre),
+            c=settings.c,
+            d=settings.d,
+            stop_below=stop_below,
+        )
         for level, ell in enumerate(settings.levels):
             product, norm = self._clouds(problem, Kernel(ell))
             climbers = climbers_at(product, poses)
@@ -122,8 +131,9 @@ class Cvo(ConfiguredMethod[CvoSettings]):
             for first in range(0, most, _BLOCK):
                 last = min(first + _BLOCK, most)
                 run = partial(climb, product, ascent, climbers, last - first)
-                parallel_for(run, len(poses), lambda: None)
-                estimates, done = Poses(climbers.poses.copy()), level * most + last
+                parallel_for(run, len(poses), scratch=lambda: None)
+                estimates = Poses(climbers.poses.copy())
+                done = level * most + last
                 observer.trace("ascent", done, estimates.vectors, _costs(climbers.value, norm))
                 observer.progress("ascent", done, most * len(settings.levels))
                 if climbers.done.all():
@@ -133,21 +143,23 @@ class Cvo(ConfiguredMethod[CvoSettings]):
 
     def _clouds(self, problem: RegistrationProblem, kernel: Kernel) -> tuple[Product, float]:
         """Return F, and |f_x| |f_z|."""
-        sdf, lattice, contacts = problem.sdf, problem.free_resolution, problem.points.contacts
+        sdf = problem.sdf
+        lattice = problem.free_resolution
+        contacts = problem.points.contacts
         band = self.settings.surface_band or sdf.resolution
         free = problem.points.free if self.settings.free_space else np.zeros((0, 3))
         balanced = self.settings.balanced and len(contacts) and len(free)
         weight = len(free) / len(contacts) if balanced else 1.0
-        surface_z = class_field(sdf, kernel, band, "surface")
-        observed = weight * cloud_norm(contacts, kernel, lattice)
+        surface_z = class_field(sdf, kernel, band=band, name="surface")
+        observed = weight * cloud_norm(contacts, kernel, lattice=lattice)
         of_object = weight * surface_z.norm
-        terms = [ClassTerm(contacts.T.copy(), surface_z, weight)]
+        terms = [ClassTerm(contacts.T.copy(), surface_z, weight=weight)]
         if self.settings.free_space:
-            free_z = class_field(sdf, kernel, band, "free")
-            observed += cloud_norm(free, kernel, lattice)
+            free_z = class_field(sdf, kernel, band=band, name="free")
+            observed += cloud_norm(free, kernel, lattice=lattice)
             of_object += free_z.norm
-            alone, cubes, wide = full_cubes(free, kernel, lattice)
-            cube_z = class_field(sdf, wide, band, "free") if len(cubes) else free_z
+            alone, cubes, wide = full_cubes(free, kernel, lattice=lattice)
+            cube_z = class_field(sdf, wide, band=band, name="free") if len(cubes) else free_z
             terms[:0] = ClassTerm(alone.T.copy(), free_z), ClassTerm(cubes.T.copy(), cube_z)
         return tuple(terms), float(np.sqrt(observed * of_object))
 
@@ -180,9 +192,11 @@ class Climbers(NamedTuple):
 
 def climbers_at(product: Product, poses: FloatArray) -> Climbers:
     """Return climbers at copies of poses (B, 12), before the first step."""
-    value, step = values_of(product, poses), np.zeros(len(poses))
-    stalled, done = np.zeros(len(poses), dtype=np.int64), np.zeros(len(poses), dtype=bool)
-    return Climbers(poses.copy(), value, step, stalled, done)
+    value = values_of(product, poses)
+    step = np.zeros(len(poses))
+    stalled = np.zeros(len(poses), dtype=np.int64)
+    done = np.zeros(len(poses), dtype=bool)
+    return Climbers(poses.copy(), value, step=step, stalled=stalled, done=done)
 
 
 @compiled
@@ -216,7 +230,9 @@ def _direction(product, ascent, pose):
 def _step(product, ascent, pose, xi, slope, climbers, n):
     """Move climber n by the best step found along the flow; whether it goes on from there."""
     before, most = climbers.value[n], ascent.most
-    tau, other, at_other = max(climbers.step[n], ascent.least), 0.0, 0.0
+    tau = max(climbers.step[n], ascent.least)
+    other = 0.0
+    at_other = 0.0
     value = product_at(product, _moved_along(pose, xi, tau))
     vertex = _vertex(tau, value - before, slope)
     while value > before and vertex > tau and tau < most:
@@ -225,7 +241,10 @@ def _step(product, ascent, pose, xi, slope, climbers, n):
         if not beyond > value:
             other, at_other = longer, beyond
             break
-        other, at_other, tau, value = tau, value, longer, beyond
+        other = tau
+        at_other = value
+        tau = longer
+        value = beyond
         vertex = _vertex(tau, value - before, slope)
     while value <= before and tau > ascent.least / 1024.0:
         other, at_other = tau, value
@@ -304,7 +323,9 @@ def flow_at(product, pose, centre):
     """Return F, sum x_i x h_i and sum h_i with h_i = R^T grad f(R x_i + t), x_i from the centre."""
     value = x = y = z = p = q = r = 0.0
     for term in product:
-        points, box, m = term.points, term.field.box, term.weight
+        points = term.points
+        box = term.field.box
+        m = term.weight
         f = gx = gy = gz = u = v = w = 0.0  # sums of f(p_i), grad f and p_i x grad f
         for n in range(points.shape[1]):
             a, b, c = moved(pose, points[0, n], points[1, n], points[2, n])
@@ -313,7 +334,10 @@ def flow_at(product, pose, centre):
                 s, nx, ny, nz = distance_between_nodes(box, term.field.table, at, i, j, k)
                 f, gx, gy, gz = f + s, gx + nx, gy + ny, gz + nz
                 u, v, w = u + (b * nz - c * ny), v + (c * nx - a * nz), w + (a * ny - b * nx)
-        value, x, y, z = value + m * f, x + m * gx, y + m * gy, z + m * gz
+        value = value + m * f
+        x = x + m * gx
+        y = y + m * gy
+        z = z + m * gz
         p, q, r = p + m * u, q + m * v, r + m * w
     # R (x_i x h_i) = (p_i - R c - t) x grad f(p_i)
     a, b, c = moved(pose, centre[0], centre[1], centre[2])
@@ -355,7 +379,7 @@ Product = tuple[ClassTerm, ...]  # F(X) = sum over classes of W sum_i f(R x_i + 
 def values_of(product: Product, poses: FloatArray) -> FloatArray:
     """Return F (B,) at poses (B, 12)."""
     out = np.empty(len(poses))
-    parallel_for(partial(_fill_values, product, poses, out), len(poses), lambda: None)
+    parallel_for(partial(_fill_values, product, poses, out), len(poses), scratch=lambda: None)
     return out
 
 
@@ -380,7 +404,7 @@ def product_at(product, pose):
     return total
 
 
-def class_field(sdf: SdfGrid, kernel: Kernel, band: float, name: str) -> ClassField:
+def class_field(sdf: SdfGrid, kernel: Kernel, *, band: float, name: str) -> ClassField:
     """Return nodes of a grid by class: "surface" within `band` metres of it, "free" beyond."""
 
     def make() -> ClassField:
@@ -389,15 +413,20 @@ def class_field(sdf: SdfGrid, kernel: Kernel, band: float, name: str) -> ClassFi
         stride = max(1, math.floor(kernel.ell / (FINENESS * spacing) + 1e-9))
         reach = kernel.reach(spacing, stride)
         shape = [-(-(count - 1 + 2 * reach) // stride) + 1 for count in sdf.shape]
-        source, table = members.astype(np.float64), np.empty((*shape, 4), dtype=np.float32)
-        table[..., 0] = value = kernel.amplitude * _blurred(source, kernel, spacing, shape, stride)
+        source = members.astype(np.float64)
+        table = np.empty((*shape, 4), dtype=np.float32)
+        table[..., 0] = value = kernel.amplitude * _blurred(
+            source, kernel, spacing=spacing, shape=shape, stride=stride
+        )
         for axis in range(3):  # ell^2 grad f = sum k(., z) z - f p
             z, p = (np.ogrid[tuple(map(slice, counts))][axis] for counts in (sdf.shape, shape))
-            moment = kernel.amplitude * _blurred(source * z, kernel, spacing, shape, stride)
+            moment = kernel.amplitude * _blurred(
+                source * z, kernel, spacing=spacing, shape=shape, stride=stride
+            )
             slope = moment - (p * stride - reach) * value
             table[..., axis + 1] = spacing / (kernel.ell * kernel.ell) * slope
-        box = box_of(sdf.origin - reach * spacing, stride * spacing, shape, between=True)
-        made = ClassField(box, table.reshape(-1), 0.0)
+        box = box_of(sdf.origin - reach * spacing, stride * spacing, shape=shape, between=True)
+        made = ClassField(box, table.reshape(-1), norm=0.0)
         nodes = ClassTerm((sdf.origin + np.argwhere(members) * spacing).T.copy(), made)
         norm = values_of((nodes,), Poses.of(np.eye(4)[None]).numbers)
         return made._replace(norm=float(norm[0]))
@@ -405,12 +434,13 @@ def class_field(sdf: SdfGrid, kernel: Kernel, band: float, name: str) -> ClassFi
     return sdf.derived(("rkhs", name, kernel, band), make)
 
 
-def cloud_norm(points: FloatArray, kernel: Kernel, lattice: float) -> float:
+def cloud_norm(points: FloatArray, kernel: Kernel, *, lattice: float) -> float:
     """Return <f, f> of a cloud (N, 3): the sum over all pairs.
 
     Many points on a lattice of that spacing, metres, are summed by a grid, unless it is too large.
     """
-    reach, nodes = kernel.reach(lattice), _nodes_of(points, lattice)
+    reach = kernel.reach(lattice)
+    nodes = _nodes_of(points, lattice)
     if nodes is None or math.prod((nodes.max(axis=0) + 1.0 + 2.0 * reach).tolist()) > MOST_NODES:
         return kernel.amplitude * _sum_of_pairs(points, kernel.ell)
     sides = [int(last) + 1 for last in nodes.max(axis=0)]
@@ -418,7 +448,9 @@ def cloud_norm(points: FloatArray, kernel: Kernel, lattice: float) -> float:
     np.add.at(grid, tuple(nodes.astype(np.int64).T), 1.0)
     around = [side + 2 * reach for side in sides]
     inside = tuple(slice(reach, reach + side) for side in sides)
-    terms = (grid * _blurred(grid, kernel, lattice, around, 1)[inside]).reshape(-1)
+    terms = (
+        grid * _blurred(grid, kernel, spacing=lattice, shape=around, stride=1)[inside]
+    ).reshape(-1)
     return kernel.amplitude * float(np.cumsum(terms)[-1])  # added in their order
 
 
@@ -447,7 +479,7 @@ def _nodes_of(points: FloatArray, lattice: float) -> FloatArray | None:
 
 
 def full_cubes(
-    points: FloatArray, kernel: Kernel, lattice: float
+    points: FloatArray, kernel: Kernel, *, lattice: float
 ) -> tuple[FloatArray, FloatArray, Kernel]:
     """Return points (N, 3) left alone, centres (C, 3) of full lattice cubes, a cube's kernel.
 
@@ -469,17 +501,20 @@ def full_cubes(
 
 
 def _blurred(
-    source: FloatArray, kernel: Kernel, spacing: float, shape: list[int], stride: int
+    source: FloatArray, kernel: Kernel, *, spacing: float, shape: list[int], stride: int
 ) -> FloatArray:
     """Return a source (nx, ny, nz) blurred without amplitude, at each `stride`-th node from -K."""
     reach = kernel.reach(spacing, stride)
     x = np.arange(-reach, reach + 1) * spacing / kernel.ell
     weights = exps(-0.5 * x * x)
     for axis in (2, 1, 0):
-        before, after = source.shape[:axis], source.shape[axis + 1 :]
+        before = source.shape[:axis]
+        after = source.shape[axis + 1 :]
         rows = source.reshape(math.prod(before), source.shape[axis], math.prod(after))
         out = np.empty((len(rows), shape[axis], rows.shape[2]))
-        parallel_for(partial(_blur_rows, rows, weights, stride, out), shape[axis], lambda: None)
+        parallel_for(
+            partial(_blur_rows, rows, weights, stride, out), shape[axis], scratch=lambda: None
+        )
         source = out.reshape(*before, shape[axis], *after)
     return source
 

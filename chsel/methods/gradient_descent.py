@@ -44,7 +44,9 @@ class DescentSettings(CheckedSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_at_most("restarts x iterations", self.restarts * self.iterations, MOST_ITERATIONS)
+        require_at_most(
+            "restarts x iterations", self.restarts * self.iterations, most=MOST_ITERATIONS
+        )
         shares = self.race or (0.0,)
         falling = all(share <= before for before, share in pairwise((1.0, *shares)))
         if self.race is not None and not (falling and shares[-1] > 0.0):
@@ -61,13 +63,14 @@ class DescentSettings(CheckedSettings):
 
 
 def descend(
-    objective: Objective, starts: Poses, settings: DescentSettings, observer: Observer
+    objective: Objective, starts: Poses, *, settings: DescentSettings, observer: Observer
 ) -> tuple[Poses, FloatArray]:
     """Return estimates E' with their costs (B,), from B starts, each of which descends on its own.
 
     Starts that drop out of the race stay where they are.
     """
-    space, total = objective.space, settings.restarts * settings.iterations
+    space = objective.space
+    total = settings.restarts * settings.iterations
     vectors = space.encode(starts)
     costs = objective.costs(vectors)
     running = np.arange(len(starts))
@@ -76,7 +79,7 @@ def descend(
         lowest = np.argsort(costs[running], kind="stable")
         running = np.sort(running[lowest[: settings.runners(block, len(starts))]])
         moved, after = objective.block(
-            vectors[running], len(starts), settings.rate, settings.iterations
+            vectors[running], len(starts), rate=settings.rate, iterations=settings.iterations
         )
         before = costs[running]
         # By which fraction costs fell, on average over the starts; a cost of 0 gains nothing.
@@ -112,5 +115,5 @@ class GradientDescent(ConfiguredMethod[GradientDescentSettings]):
         space = search_space(self.settings.plane, problem.sdf)
         objective = Objective(CompiledCost.of(problem, self.settings.cost), space)
         starts = Poses.of(problem.initial_set)
-        estimates, _ = descend(objective, starts, self.settings.descent, observer)
+        estimates, _ = descend(objective, starts, settings=self.settings.descent, observer=observer)
         return ranked_hypotheses(objective, estimates, elites=estimates)

@@ -59,38 +59,44 @@ class Icp(ConfiguredMethod[IcpSettings]):
     settings_class = IcpSettings
 
     def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
-        contacts, poses = problem.points.contacts, Poses.of(problem.initial_set)
+        contacts = problem.points.contacts
+        poses = Poses.of(problem.initial_set)
         if len(contacts) == 0:
             return ranked(problem.initial_set, np.zeros(len(poses)))
         sets = contacts.T.copy(), self.surface(problem).T.copy()
         observer.trace("icp", 0, poses.vectors, _distances(sets, poses))
-        poses = self._iterated(sets, poses, observer)
+        poses = self._iterated(sets, poses, observer=observer)
         return ranked(poses.matrices, _distances(sets, poses))
 
     def surface(self, problem: RegistrationProblem) -> FloatArray:
         """Return points (Q, 3) of the object's surface that stand for it, in its frame, metres."""
-        sdf, key, count = problem.sdf, problem.key, self.settings.surface_points
+        sdf = problem.sdf
+        key = problem.key
+        count = self.settings.surface_points
         if self.settings.redraw == "registration":
-            return surface_points(sdf, count, key.stream(Purpose.ICP_SURFACE))
+            return surface_points(sdf, count, stream=key.stream(Purpose.ICP_SURFACE))
         key = StreamKey(key.seed, 0)
         stream = key.stream(Purpose.ICP_SURFACE)
-        return sdf.derived(("icp", count, key), lambda: surface_points(sdf, count, stream))
+        return sdf.derived(("icp", count, key), lambda: surface_points(sdf, count, stream=stream))
 
-    def _iterated(self, sets: _PointSets, poses: Poses, observer: Observer) -> Poses:
+    def _iterated(self, sets: _PointSets, poses: Poses, *, observer: Observer) -> Poses:
         """Return poses after as many iterations as the stop rule allows."""
-        total, scratch = self.settings.iterations, partial(_scratch, sets)
+        total = self.settings.iterations
+        scratch = partial(_scratch, sets)
         errors = np.full(len(poses), np.inf)
         for first in range(0, total, _BLOCK):
             count = min(_BLOCK, total - first)
-            history, after = np.empty((count, len(poses), 12)), np.empty((count, len(poses)))
+            history = np.empty((count, len(poses), 12))
+            after = np.empty((count, len(poses)))
             run = partial(_iterate, sets, poses.numbers, history, after)
-            parallel_for(run, len(poses), scratch)
+            parallel_for(run, len(poses), scratch=scratch)
             falling = np.ones(count, dtype=bool)  # whether any start's error falls enough
             if self.settings.stop_below is not None:
                 before = np.concatenate([errors[None], after[:-1]])
                 falling = (after < (1.0 - self.settings.stop_below) * before).any(axis=1)
             count = count if falling.all() else int(np.argmin(falling)) + 1
-            poses, errors = Poses(history[count - 1]), after[count - 1]
+            poses = Poses(history[count - 1])
+            errors = after[count - 1]
             observer.trace("icp", first + count, poses.vectors, errors.copy())
             observer.progress("icp", first + count, total)
             if not falling.all():
@@ -106,7 +112,7 @@ def _distances(sets: _PointSets, poses: Poses) -> FloatArray:
     """Return the rms distances (B,) of the contacts to their nearest surface points, metres."""
     out = np.empty(len(poses))
     run = partial(_fill_distances, sets, poses.numbers, out)
-    parallel_for(run, len(poses), partial(_scratch, sets))
+    parallel_for(run, len(poses), scratch=partial(_scratch, sets))
     return out
 
 

@@ -60,7 +60,7 @@ class Balls(NamedTuple):
 
 
 def medial_balls(
-    free: FloatArray, workspace: Workspace, resolution: float, inflation: float
+    free: FloatArray, workspace: Workspace, *, resolution: float, inflation: float
 ) -> Balls:
     """Return balls within the known-free voxels of a workspace that cover them but for `inflation`.
 
@@ -72,11 +72,12 @@ def medial_balls(
     inflation: metres by which a ball may be inflated to cover another.
     Raises SettingError where the free points span too many voxels.
     """
-    margin, (lower, upper) = 1e-6 * resolution, workspace.bounds
+    margin = 1e-6 * resolution
+    (lower, upper) = workspace.bounds
     inside = free[((free >= lower - margin) & (free <= upper + margin)).all(axis=1)]
     if len(inside) == 0:
         return Balls(np.zeros((0, 3)), np.zeros(0))
-    flags = VoxelGrid.around(inside, resolution, MOST_VOXELS).flags
+    flags = VoxelGrid.around(inside, resolution, most=MOST_VOXELS).flags
     squared = np.empty(flags.shape, dtype=np.int64)
     squared_clearances(flags, squared, 1)
     medial = _is_medial(squared)
@@ -91,7 +92,8 @@ def medial_balls(
 def _is_medial(squared: IntArray) -> BoolArray:
     """Return flags (nx, ny, nz) of voxels whose ball, by squared clearance, is in no other."""
     inner = squared[1:-1, 1:-1, 1:-1]
-    radii, medial = np.sqrt(squared.astype(np.float64)), np.zeros(squared.shape, dtype=np.bool_)
+    radii = np.sqrt(squared.astype(np.float64))
+    medial = np.zeros(squared.shape, dtype=np.bool_)
     own, kept = radii[1:-1, 1:-1, 1:-1], inner > 0
     for offset in np.ndindex(3, 3, 3):
         apart = 2.0 * math.sqrt(sum((step - 1) ** 2 for step in offset))
@@ -177,10 +179,12 @@ class MedialCost:
         if balls is None:
             free = problem.points.free if settings.ball_scale > 0.0 else np.zeros((0, 3))
             resolution, inflation = problem.free_resolution, settings.inflation
-            balls = medial_balls(free, problem.workspace, resolution, inflation)
+            balls = medial_balls(
+                free, problem.workspace, resolution=resolution, inflation=inflation
+            )
         self.balls = balls
         self.model = MedialModel(
-            field=distance_field(problem.sdf, settings.lookup, settings.outside),
+            field=distance_field(problem.sdf, settings.lookup, outside=settings.outside),
             centres=balls.centres.T.copy(),
             radii=balls.radii,
             known=problem.points.known.T.copy(),
@@ -197,7 +201,7 @@ class MedialCost:
         """Return costs (B,) of poses; infinite for one that is not finite."""
         costs = np.empty(len(poses))
         run = partial(_fill_costs, self.model, poses.numbers, costs)
-        parallel_for(run, len(poses), self.work, least=_POSES_PER_THREAD)
+        parallel_for(run, len(poses), scratch=self.work, least=_POSES_PER_THREAD)
         return costs
 
     def work(self) -> Places:
@@ -308,13 +312,14 @@ class Run(NamedTuple):
 def evolved(
     objective: MedialCost,
     initial_set: Poses,
+    *,
     settings: CmaEsSettings,
     key: StreamKey,
     observer: Observer,
 ) -> FloatArray:
     """Return search vectors (B, d) of the estimates that CMA-ES finds from E_0."""
     vectors = objective.space.encode(initial_set)
-    runs = run_all(objective, vectors, settings, key, observer)
+    runs = run_all(objective, vectors, settings=settings, key=key, observer=observer)
     if settings.starts == "per_start":
         return np.stack([run.best for run in runs])
     samples = np.empty(vectors.shape)
@@ -330,6 +335,7 @@ def _draw(strategy: Strategy, normals: FloatArray, samples: FloatArray) -> None:
 def run_all(
     objective: MedialCost,
     vectors: FloatArray,
+    *,
     settings: CmaEsSettings,
     key: StreamKey,
     observer: Observer,
@@ -341,8 +347,8 @@ def run_all(
     total = settings.most_generations(dimension, size)
     runs = [
         Run(
-            strategy=strategy_around(start, size, settings.sigma0),
-            batch=batch_of(size, dimension, 0),
+            strategy=strategy_around(start, size, sigma0=settings.sigma0),
+            batch=batch_of(size, dimension, measures=0),
             best=start.copy(),
             cost=np.array([cost]),
             generations=np.zeros(1, dtype=np.int64),
@@ -362,7 +368,7 @@ def run_all(
                 evolve(objective.model, objective.space_arrays, work, run, drawn, settings.tolfun)
 
     for done in range(0, total, block):
-        parallel_for(advance, len(runs), objective.work)
+        parallel_for(advance, len(runs), scratch=objective.work)
         _trace(observer, runs)
         observer.progress("cma_es", min(done + block, total), total)
         if all(run.ended[0] for run in runs):
@@ -373,7 +379,8 @@ def run_all(
 def _trace(observer: Observer, runs: list[Run]) -> None:
     """Show the observer the best vector of each run so far."""
     generation = max(int(run.generations[0]) for run in runs)
-    vectors, costs = np.stack([run.best for run in runs]), np.array([run.cost[0] for run in runs])
+    vectors = np.stack([run.best for run in runs])
+    costs = np.array([run.cost[0] for run in runs])
     observer.trace("cma_es", generation, vectors, costs)
 
 
@@ -386,7 +393,10 @@ def evolve(
     The better half of a generation are parents, weighted by rank, all weights positive.
     """
     strategy, batch = run.strategy, run.batch
-    vectors, costs, value, order = batch.vectors, batch.objectives, batch.value, batch.order
+    vectors = batch.vectors
+    costs = batch.objectives
+    value = batch.value
+    order = batch.order
     for generation in range(len(normals)):
         if run.ended[0]:
             break
@@ -426,8 +436,11 @@ class MedialConstraint(ConfiguredMethod[MedialConstraintSettings]):
     def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
         space = search_space(self.settings.plane, problem.sdf)
         objective = MedialCost(problem, self.settings.cost, space=space)
-        initial_set, settings = Poses.of(problem.initial_set), self.settings.cma_es
-        vectors = evolved(objective, initial_set, settings, problem.key, observer)
+        initial_set = Poses.of(problem.initial_set)
+        settings = self.settings.cma_es
+        vectors = evolved(
+            objective, initial_set, settings=settings, key=problem.key, observer=observer
+        )
         estimates = space.poses(vectors)
         return ranked_hypotheses(objective, estimates, elites=estimates)
 
@@ -467,27 +480,55 @@ class MedialConstraintCmaMe(ConfiguredMethod[MedialConstraintCmaMeSettings]):
     settings_class = MedialConstraintCmaMeSettings
 
     def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
-        settings, key, count = self.settings, problem.key, len(problem.initial_set)
-        space, grid = search_space(settings.plane, problem.sdf), settings.archive
+        settings = self.settings
+        key = problem.key
+        count = len(problem.initial_set)
+        space = search_space(settings.plane, problem.sdf)
+        grid = settings.archive
         objective = MedialCost(problem, settings.cost, space=space)
         measure = measure_named(grid.measure, planar=settings.plane is not None)
         # E' <- CMA-ES on E_0; as poses, so that it holds what hypotheses can be
         initial_set = Poses.of(problem.initial_set)
-        vectors = evolved(objective, initial_set, settings.cma_es, key, observer)
-        estimates = evaluated(objective, measure, space.encode(space.poses(vectors)))
+        vectors = evolved(
+            objective, initial_set, settings=settings.cma_es, key=key, observer=observer
+        )
+        estimates = evaluated(objective, measure, vectors=space.encode(space.poses(vectors)))
         # M <- the archive that measures of E' size, holding E' and E_l
         known = len(problem.points.known)
-        archive = sized_archive(estimates, measure, grid, known, space.dimension)
+        archive = sized_archive(
+            estimates, measure, settings=grid, known_count=known, dimension=space.dimension
+        )
         low_cost_set = space.encode(Poses.of(problem.low_cost_set))
-        archive.update_cells(estimates, evaluated(objective, measure, low_cost_set))
+        archive.update_cells(estimates, evaluated(objective, measure, vectors=low_cost_set))
         # M <- CMA-ME(M, C_M, n_o)
-        first, best = space.encode(initial_set[:1])[0], archive.best_solution
+        first = space.encode(initial_set[:1])[0]
+        best = archive.best_solution
         start = first if settings.emitter.start == "initial" else best
-        fill_archive("cma_me", objective, archive, start, count, settings.emitter, key, observer)
+        fill_archive(
+            "cma_me",
+            objective,
+            archive=archive,
+            start=start,
+            count=count,
+            settings=settings.emitter,
+            key=key,
+            observer=observer,
+        )
         # E <- cells of M with the |E_0| lowest costs
         stream, elites = key.stream(Purpose.RESAMPLE), space.poses(archive.solutions)
-        chosen = select_elites(archive.costs, elites, problem, space, settings.output, stream)
+        chosen = select_elites(
+            archive.costs,
+            elites,
+            problem=problem,
+            space=space,
+            settings=settings.output,
+            stream=stream,
+        )
         snapshot = archive.snapshot(settings.emitter.iterations, 0)
         return ranked_hypotheses(
-            objective, elites[chosen], archive.occupied[chosen], elites, snapshot
+            objective,
+            elites[chosen],
+            cells=archive.occupied[chosen],
+            elites=elites,
+            archive=snapshot,
         )

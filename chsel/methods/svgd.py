@@ -47,7 +47,8 @@ class Particles(NamedTuple):
 def particles_at(vectors: FloatArray) -> Particles:
     """Return particles at search vectors (B, d), which are copied."""
     count, dimension = vectors.shape
-    moments, pairs = np.zeros((count, 2, dimension)), np.zeros((2, count * (count - 1) // 2))
+    moments = np.zeros((count, 2, dimension))
+    pairs = np.zeros((2, count * (count - 1) // 2))
     scores, directions = np.zeros((2, count, dimension))
     return Particles(vectors.copy(), moments, np.ones(2), scores, directions, *pairs)
 
@@ -74,7 +75,9 @@ def svgd(
         powers[0] *= BETA1
         powers[1] *= BETA2
         for n in range(len(vectors)):
-            moments, vector, direction = particles.moments[n], vectors[n], particles.directions[n]
+            moments = particles.moments[n]
+            vector = vectors[n]
+            direction = particles.directions[n]
             for j in range(len(vector)):
                 vector[j] += adam_step(direction[j], moments, j, powers, settings.rate, EPSILON)
 
@@ -105,7 +108,9 @@ def direct(particles: Any, scale: Any, median: Any) -> None:
     k(a, b) = exp(-gamma |a - b|^2), gamma = 1 / (2 h^2 + 1e-8), h = scale or, if median, from
     h^2 = median |X_i - X_j|^2 / (2 ln(B + 1)) over pairs (Liu and Wang, 2016, Sec. 5).
     """
-    vectors, scores, directions = particles.vectors, particles.scores, particles.directions
+    vectors = particles.vectors
+    scores = particles.scores
+    directions = particles.directions
     count, dimension = vectors.shape
     pair = 0
     for i in range(count):
@@ -191,12 +196,13 @@ class Svgd(ConfiguredMethod[SvgdSettings]):
     settings_class = SvgdSettings
 
     def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
-        require_at_most("number of poses in E_0", len(problem.initial_set), MOST_PARTICLES)
+        require_at_most("number of poses in E_0", len(problem.initial_set), most=MOST_PARTICLES)
         space = search_space(self.settings.plane, problem.sdf)
         objective = Objective(CompiledCost.of(problem, self.settings.cost), space)
-        settings, total = self.settings, self.settings.iterations
+        settings = self.settings
+        total = self.settings.iterations
         median = settings.kernel == "median"
-        step = SteinStep(settings.sharpness, settings.scale, median, settings.rate)
+        step = SteinStep(settings.sharpness, settings.scale, median=median, rate=settings.rate)
         particles = particles_at(space.encode(Poses.of(problem.initial_set)))
         vectors = particles.vectors
         # Scratch in which particles remember their neighbours, if it is not too large.

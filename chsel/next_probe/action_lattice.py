@@ -49,7 +49,7 @@ class ActionSettings(CheckedSettings):
     setup: Annotated[float, not_negative] = 1.0  # seconds that every probe takes besides
 
 
-def straight_actions(settings: ActionSettings, poses: FloatArray, length: FloatArray) -> Actions:
+def straight_actions(settings: ActionSettings, poses: FloatArray, *, length: FloatArray) -> Actions:
     """Return actions from poses (A, 4, 4) along z for lengths (A,), as far as reach allows.
 
     Those of length 0 are left out. Seconds, if a speed is given: there and back, and the setup.
@@ -68,15 +68,15 @@ def straight_actions(settings: ActionSettings, poses: FloatArray, length: FloatA
     poses, length = poses[kept], length[kept]
     if settings.speed is None:
         return Actions(poses, length)
-    return Actions(poses, length, settings.setup + 2.0 * length / settings.speed)
+    return Actions(poses, length, seconds=settings.setup + 2.0 * length / settings.speed)
 
 
 def forward_actions(
     settings: ActionSettings,
     workspace: Workspace,
+    *,
     hand: HandShape,
     rotation: FloatArray,
-    *,
     start: float,
     length: float,
 ) -> Actions:
@@ -87,14 +87,15 @@ def forward_actions(
     """
 
     def lattice(spacing: float) -> _Lattice:
-        approach = _Approach(workspace, hand, rotation)
+        approach = _Approach(workspace, hand, rotation=rotation)
         places = approach.places(spacing)
         return approach.poses(places, start), np.full(len(places), length)
 
-    return straight_actions(settings, *_few_enough(settings, workspace, lattice))
+    starts, lengths = _few_enough(settings, workspace, lattice=lattice)
+    return straight_actions(settings, starts, length=lengths)
 
 
-def around_actions(settings: ActionSettings, workspace: Workspace, hand: HandShape) -> Actions:
+def around_actions(settings: ActionSettings, workspace: Workspace, *, hand: HandShape) -> Actions:
     """Return lattices of actions that cross a workspace from outside, as far as the floor.
 
     From the four sides, and from above. Opposite sides are half a spacing apart, as what one of
@@ -104,7 +105,7 @@ def around_actions(settings: ActionSettings, workspace: Workspace, hand: HandSha
     def lattice(spacing: float) -> _Lattice:
         parts = []
         for rotation, shift in _AROUND:
-            approach = _Approach(workspace, hand, rotation)
+            approach = _Approach(workspace, hand, rotation=rotation)
             places = approach.places(spacing, shift)
             start = approach.nearest - MARGIN - float(hand.bounds[1, 2])
             poses = approach.poses(places, start)
@@ -112,7 +113,8 @@ def around_actions(settings: ActionSettings, workspace: Workspace, hand: HandSha
             parts.append((poses[length > 0.0], length[length > 0.0]))
         return np.concatenate([part[0] for part in parts]), np.concatenate([p[1] for p in parts])
 
-    return straight_actions(settings, *_few_enough(settings, workspace, lattice))
+    starts, lengths = _few_enough(settings, workspace, lattice=lattice)
+    return straight_actions(settings, starts, length=lengths)
 
 
 def _rotation(across: tuple[float, ...], forward: tuple[float, ...]) -> FloatArray:
@@ -143,7 +145,7 @@ class _Approach:
     as coordinates (2,) along the hand's wide side, and along the axis to both, which points up.
     """
 
-    def __init__(self, workspace: Workspace, hand: HandShape, rotation: FloatArray) -> None:
+    def __init__(self, workspace: Workspace, hand: HandShape, *, rotation: FloatArray) -> None:
         lower, upper = workspace.bounds
         lower[2] = max(lower[2], FLOOR)
         upper[2] = max(upper[2], lower[2])  # of a workspace below the floor nothing is left
@@ -164,13 +166,13 @@ class _Approach:
         If the hand moves horizontally, the lowest row is just above the floor.
         """
         low, high = self._spans.min(axis=0), self._spans.max(axis=0)
-        first = _centred(low[0], high[0], spacing) + shift * spacing
+        first = _centred(low[0], high[0], spacing=spacing) + shift * spacing
         if self._direction[2] == 0.0:
             bottom = max(low[1], FLOOR + CLEARANCE - self._lowest)
             count = int((high[1] - bottom) / spacing) + 1 if high[1] >= bottom else 0
             second = bottom + spacing * np.arange(count)
         else:
-            second = _centred(low[1], high[1], spacing)
+            second = _centred(low[1], high[1], spacing=spacing)
         return np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1).reshape(-1, 2)
 
     def poses(self, places: FloatArray, start: float) -> FloatArray:
@@ -201,7 +203,7 @@ class _Approach:
         return np.where(useful, length, 0.0)
 
 
-def _centred(low: float, high: float, spacing: float) -> FloatArray:
+def _centred(low: float, high: float, *, spacing: float) -> FloatArray:
     """Return the middles (N,) of intervals of a spacing that cover what is between two numbers."""
     count = max(int(np.ceil((high - low) / spacing - 0.5)), 1)
     steps: FloatArray = np.arange(count, dtype=np.float64) - 0.5 * (count - 1)
@@ -209,7 +211,7 @@ def _centred(low: float, high: float, spacing: float) -> FloatArray:
 
 
 def _few_enough(
-    settings: ActionSettings, workspace: Workspace, lattice: Callable[[float], _Lattice]
+    settings: ActionSettings, workspace: Workspace, *, lattice: Callable[[float], _Lattice]
 ) -> _Lattice:
     """Return the lattice at the spacing of the settings, or the next coarser one allowed."""
     sides = np.sort(np.ptp(workspace.bounds, axis=0))
@@ -226,7 +228,8 @@ def _few_enough(
 
 def _way_within(reach: ReachBall, poses: FloatArray) -> FloatArray:
     """Return lengths (A,) that a hand can go from poses (A, 4, 4) along z; -1 from outside."""
-    offset, direction = poses[:, :3, 3] - np.array(reach.center), poses[:, :3, 2]
+    offset = poses[:, :3, 3] - np.array(reach.center)
+    direction = poses[:, :3, 2]
     along = (offset * direction).sum(axis=1)
     inside = reach.radius * reach.radius - (offset * offset).sum(axis=1)
     way = np.sqrt(np.maximum(along * along + inside, 0.0)) - along

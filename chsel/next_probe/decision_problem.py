@@ -44,9 +44,11 @@ class HandShape:
     """
 
     def __init__(self, vertices: Any, faces: Any) -> None:
-        self.vertices: FloatArray = frozen("hand vertices", vertices, (None, 3), error=SettingError)
+        self.vertices: FloatArray = frozen(
+            "hand vertices", vertices, shape=(None, 3), error=SettingError
+        )
         self.faces: IntArray = frozen(
-            "hand faces", faces, (None, 3), dtype=np.int64, error=SettingError
+            "hand faces", faces, shape=(None, 3), dtype=np.int64, error=SettingError
         )
         if len(self.faces) == 0 or self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
             raise SettingError("the hand has no faces between its vertices; accepted: a mesh")
@@ -73,7 +75,7 @@ class HandShape:
         lower = vertices[:, :2].min(axis=0) - CELL
         counts = np.ceil((vertices[:, :2].max(axis=0) + CELL - lower) / CELL).astype(np.int64)
         heights = np.full(tuple(counts), -np.inf)
-        front = HandFront(heights, lower, CELL)
+        front = HandFront(heights, lower, cell=CELL)
         raise_front(front, vertices, np.array(self.faces))
         heights.setflags(write=False)
         return front
@@ -130,7 +132,7 @@ class Actions:
         for name in ("length", "seconds"):
             value = getattr(self, name)
             if value is not None:
-                value = frozen(f"{name} of actions", value, (len(poses),), error=SettingError)
+                value = frozen(f"{name} of actions", value, shape=(len(poses),), error=SettingError)
                 if not (value > 0.0).all():
                     raise SettingError(f"{name} of actions has {value.min()}; accepted: above 0")
                 object.__setattr__(self, name, value)
@@ -156,7 +158,7 @@ class WeightedPoses:
         poses = _near_poses("belief", self.object_from_world)
         if len(poses) == 0:
             raise PoseError("the belief has no poses; accepted: at least one")
-        weights = frozen("weights", self.weights, (len(poses),), error=SettingError)
+        weights = frozen("weights", self.weights, shape=(len(poses),), error=SettingError)
         if weights.min() < 0.0 or abs(float(weights.sum()) - 1.0) > 1e-6:
             raise SettingError("weights are not a distribution; accepted: none negative, of sum 1")
         object.__setattr__(self, "object_from_world", poses)
@@ -171,7 +173,7 @@ class WeightedPoses:
         return digest(self.object_from_world, self.weights)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class DecisionProblem:
     """Everything that determines one decision, and nothing else but a policy's settings."""
 
@@ -188,9 +190,13 @@ class DecisionProblem:
 
     def __post_init__(self) -> None:
         require_positive("free_resolution", self.free_resolution)
-        require_choice("verdict", self.verdict, ("", *VERDICTS))
+        require_choice("verdict", self.verdict, accepted=("", *VERDICTS))
         flags = frozen(
-            "available", self.available, (len(self.actions),), dtype=np.bool_, error=SettingError
+            "available",
+            self.available,
+            shape=(len(self.actions),),
+            dtype=np.bool_,
+            error=SettingError,
         )
         object.__setattr__(self, "available", flags)
 
@@ -205,7 +211,7 @@ class DecisionProblem:
         return digest(text, numbers, self.available, key, *verdict)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Decision:
     """The result of one decision. Scores and forecasts are those of all A actions.
 
@@ -224,19 +230,25 @@ class Decision:
     contacts: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
-        require_choice("stop", self.stop, STOPS)
+        require_choice("stop", self.stop, accepted=STOPS)
 
     @cached_property
     def digest(self) -> str:
         """Digest of all of it."""
-        arrays = self.score, self.hit_chance, self.blocked_chance, self.expected_spread
         numbers = np.array([float(self.chosen), float(STOPS.index(self.stop)), self.spread])
-        return digest(numbers, *arrays, self.contacts)
+        return digest(
+            numbers,
+            self.score,
+            self.hit_chance,
+            self.blocked_chance,
+            self.expected_spread,
+            self.contacts,
+        )
 
 
 def _near_poses(name: str, transforms: FloatArray) -> FloatArray:
     """Return rigid transforms (B, 4, 4); PoseError for others, or farther than FARTHEST."""
-    poses = frozen(name, transforms, (None, 4, 4), error=PoseError)
+    poses = frozen(name, transforms, shape=(None, 4, 4), error=PoseError)
     check_rigid(name, poses)
     far = np.abs(poses[:, :3, 3]).max(axis=1, initial=0.0) > FARTHEST
     if far.any():

@@ -59,7 +59,7 @@ class _View(NamedTuple):
 
 
 def first_contacts(
-    sdf: SdfGrid, belief: WeightedPoses, actions: Actions, hand: HandShape
+    sdf: SdfGrid, belief: WeightedPoses, *, actions: Actions, hand: HandShape
 ) -> FirstContacts:
     """Follow every action in every pose to the first contact of the hand's front.
 
@@ -70,7 +70,8 @@ def first_contacts(
     surface = touched_points(sdf)
     points = surface.points
     poses = np.array(Poses.of(belief.object_from_world).numbers)
-    count, front = len(poses), hand.front
+    count = len(poses)
+    front = hand.front
     travel = np.full((count, len(actions)), np.inf)
     contact = np.zeros((count, len(actions), 3))
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -80,14 +81,17 @@ def first_contacts(
     groups = list(moves_by_orientation(actions))
 
     def scratch() -> _View:
-        nearest, begin = np.empty((size, size), np.int64), np.empty((size, size + 1), np.int64)
-        return _View(nearest, np.empty(points.shape), begin, np.empty(len(points), np.int64))
+        nearest = np.empty((size, size), np.int64)
+        begin = np.empty((size, size + 1), np.int64)
+        return _View(
+            nearest, np.empty(points.shape), begin=begin, order=np.empty(len(points), np.int64)
+        )
 
     def run(first: int, last: int, view: _View) -> None:
         for moves in groups:
             meet(surface, poses, moves, front, view, cell, (travel, contact), (first, last))
 
-    parallel_for(run, count, scratch, least=10)
+    parallel_for(run, count, scratch=scratch, least=10)
     return FirstContacts(travel, contact)
 
 
@@ -96,13 +100,13 @@ def touched_points(sdf: SdfGrid) -> TouchedPoints:
 
     def make() -> TouchedPoints:
         stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
-        fine = surface_points(sdf, _FINE_POINTS, stream)
+        fine = surface_points(sdf, _FINE_POINTS, stream=stream)
         points = fine[farthest_points(fine[:_CANDIDATES], POINTS)]
         owner = np.empty(len(fine), dtype=np.int64)
         find_nearest(points, fine, owner)
         order = np.argsort(owner, kind="stable")
         first = np.searchsorted(owner[order], np.arange(len(points) + 1))
-        return TouchedPoints(points, np.ascontiguousarray(fine[order]), first)
+        return TouchedPoints(points, np.ascontiguousarray(fine[order]), first=first)
 
     return sdf.derived("touched", make)
 
@@ -118,7 +122,7 @@ def moves_by_orientation(actions: Actions) -> Iterator[Moves]:
         left &= ~same
         turn = np.ascontiguousarray(rotations[first].T)
         starts = rotated(turn, actions.world_from_hand[which, :3, 3])
-        yield Moves(turn.reshape(-1), starts, actions.length[which], which)
+        yield Moves(turn.reshape(-1), starts, length=actions.length[which], which=which)
 
 
 @compiled
@@ -140,10 +144,18 @@ def meet(
 ) -> None:
     """Fill the rows of some poses (first, last) in `out`, travel and contact of FirstContacts."""
     travel, contact = out
-    heights, hx, hy, side = front.heights, front.lower[0], front.lower[1], front.cell
+    heights = front.heights
+    hx = front.lower[0]
+    hy = front.lower[1]
+    side = front.cell
     nx, ny = heights.shape
-    seen, turn, fine = view.seen, moves.rotation, surface.fine
-    width_x, width_y, per_side, per_cell = nx * side, ny * side, 1.0 / side, 1.0 / cell
+    seen = view.seen
+    turn = moves.rotation
+    fine = surface.fine
+    width_x = nx * side
+    width_y = ny * side
+    per_side = 1.0 / side
+    per_cell = 1.0 / cell
     best = np.empty(3, dtype=np.int64)
     for k in range(some[0], some[1]):
         hand_from_object = _hand_from_object(turn, poses[k])
@@ -155,7 +167,9 @@ def meet(
             last = int(min(max((x + width_x - low_x) * per_cell + 1.0, 0.0), size + 0.0))
             left = int(min(max((y - low_y) * per_cell, 0.0), size + 0.0))
             right = int(min(max((y + width_y - low_y) * per_cell + 1.0, 0.0), size + 0.0))
-            least, second, third = np.inf, np.inf, np.inf
+            least = np.inf
+            second = np.inf
+            third = np.inf
             best[:] = -1
             for row in range(first, last):
                 for n in range(view.begin[row, left], view.begin[row, right]):

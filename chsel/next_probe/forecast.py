@@ -61,6 +61,7 @@ def belief_after(hypotheses: Hypotheses, settings: BeliefSettings) -> WeightedPo
 def belief_before(
     sdf: SdfGrid,
     points: KnownPoints,
+    *,
     workspace: Workspace,
     key: StreamKey,
     settings: BeliefSettings,
@@ -72,31 +73,31 @@ def belief_before(
     """
     stream = key.stream(Purpose.PRIOR_BELIEF)
     rotation = random_rotations(stream, _DRAWN)  # world_from_object
-    centre = uniforms(stream, workspace.lower, workspace.upper, (_DRAWN, 3))
+    centre = uniforms(stream, workspace.lower, upper=workspace.upper, shape=(_DRAWN, 3))
     position = centre - rotated(rotation, object_centre(sdf))
     poses = Poses.of(inverse(compose(rotation, position)))
     if settings.floor is not None:
-        position[:, 2] -= heights(sdf, poses, settings.floor)
+        position[:, 2] -= heights(sdf, poses, floor=settings.floor)
         poses = Poses.of(inverse(compose(rotation, position)))
     free = points.free
-    depth = _depths(sdf, poses, free[evenly_spaced(len(free), _SOME_FREE)])
+    depth = _depths(sdf, poses, free=free[evenly_spaced(len(free), _SOME_FREE)])
     missing = settings.poses
     for n in np.flatnonzero(depth <= sdf.resolution):
         if missing == 0:
             break
-        depth[n] = _depths(sdf, poses[n : n + 1], free)[0]
+        depth[n] = _depths(sdf, poses[n : n + 1], free=free)[0]
         missing -= depth[n] <= sdf.resolution
     order = np.argsort(depth, kind="stable")[: settings.poses]
     return WeightedPoses(poses.matrices[order], np.full(len(order), 1.0 / len(order)))
 
 
-def _depths(sdf: SdfGrid, poses: Poses, free: FloatArray) -> FloatArray:
+def _depths(sdf: SdfGrid, poses: Poses, *, free: FloatArray) -> FloatArray:
     """Return depth (B,) of the deepest of free points (N, 3), metres, at least the resolution."""
-    deepest: FloatArray = -signed_distances(sdf, poses, free).min(axis=1, initial=np.inf)
+    deepest: FloatArray = -signed_distances(sdf, poses, points=free).min(axis=1, initial=np.inf)
     return np.maximum(deepest, sdf.resolution)
 
 
-def heights(sdf: SdfGrid, poses: Poses, floor: float) -> FloatArray:
+def heights(sdf: SdfGrid, poses: Poses, *, floor: float) -> FloatArray:
     """Return heights (B,) of the object's lowest point above the floor in each pose, metres."""
     lowest: FloatArray = outline_in_world(sdf, poses)[..., 2].min(axis=1) - floor
     return lowest
@@ -127,7 +128,7 @@ class Forecast:
     def first(self) -> FirstContacts:
         """The first contacts of each action, by pose."""
         of = self.problem
-        return first_contacts(of.sdf, of.belief, of.actions, of.hand)
+        return first_contacts(of.sdf, of.belief, actions=of.actions, hand=of.hand)
 
     @property
     def hit(self) -> BoolArray:
@@ -159,15 +160,18 @@ class Forecast:
     def gains(self) -> _Gains:
         """The gains of each action."""
         count = len(self.problem.actions)
-        gains = _Gains(np.zeros(count), np.empty(count), np.empty(count), np.ones(count))
-        weights, distances = np.array(self.problem.belief.weights), self.distances
+        gains = _Gains(
+            np.zeros(count), np.empty(count), loss=np.empty(count), surviving=np.ones(count)
+        )
+        weights = np.array(self.problem.belief.weights)
+        distances = self.distances
         contacts = self.first  # before threads begin, which must not wait for each other
         size = len(weights)
 
         def run(first: int, last: int, scratch: Any) -> None:
             overlap(contacts, weights, distances, self.noise, gains, scratch, (first, last))
 
-        parallel_for(run, count, lambda: np.empty((4, size)), least=20)
+        parallel_for(run, count, scratch=lambda: np.empty((4, size)), least=20)
         return gains
 
     def _chance(self, flags: BoolArray) -> FloatArray:
@@ -188,10 +192,16 @@ def overlap(
     """
     count = len(weights)
     scale = 1.0 / (8.0 * noise * noise)
-    alike, alive, far, farther = scratch[0], scratch[1], scratch[2], scratch[3]
+    alike = scratch[0]
+    alive = scratch[1]
+    far = scratch[2]
+    farther = scratch[3]
     for a in range(some[0], some[1]):
         for i in range(count):
-            alike[i], alive[i], far[i], farther[i] = weights[i], weights[i], 0.0, 0.0
+            alike[i] = weights[i]
+            alive[i] = weights[i]
+            far[i] = 0.0
+            farther[i] = 0.0
         for i in range(count):
             hit = first.travel[i, a] < np.inf
             for j in range(i + 1, count):
@@ -216,7 +226,10 @@ def overlap(
                 far[j] += weights[i] * g * d
                 farther[i] += weights[j] * g * d * d
                 farther[j] += weights[i] * g * d * d
-        information, left, loss, surviving = 0.0, 0.0, 0.0, 0.0
+        information = 0.0
+        left = 0.0
+        loss = 0.0
+        surviving = 0.0
         for i in range(count):
             if weights[i] > 0.0:
                 information -= weights[i] * log(alike[i])
@@ -239,7 +252,7 @@ class SurpriseSettings(CheckedSettings):
 
 
 def surprise(
-    problem: DecisionProblem, decision: Decision, noise: float, contact: FloatArray | None
+    problem: DecisionProblem, decision: Decision, *, noise: float, contact: FloatArray | None
 ) -> float:
     """Return -ln of the chance that was forecast for the outcome of the chosen action, nats.
 
@@ -248,10 +261,12 @@ def surprise(
     noise, are as likely as each other; the chance of a place farther off falls like a Gaussian. 6.5
     is the most: no pose had forecast anything like it.
     """
-    weights, forecast = problem.belief.weights, decision.contacts
+    weights = problem.belief.weights
+    forecast = decision.contacts
     hits = ~np.isnan(forecast[:, 0])
     places = np.where(hits[:, None], forecast, 0.0)
-    hit, scatter = float(in_order(np.where(hits, weights, 0.0))), 0.0
+    hit = float(in_order(np.where(hits, weights, 0.0)))
+    scatter = 0.0
     if hit > 0.0:
         away = places - in_order(weights * places.T) / hit
         scatter = float(in_order(np.where(hits, weights / hit * in_order(away * away), 0.0)))

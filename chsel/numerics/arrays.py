@@ -39,8 +39,8 @@ class ShapesShown:
 def frozen(
     name: str,
     value: Any,
-    shape: tuple[int | None, ...],
     *,
+    shape: tuple[int | None, ...],
     dtype: Any = np.float64,
     error: type[ChselError] = PointsError,
     finite: bool = True,
@@ -125,7 +125,7 @@ _LFS = b"version https://git-lfs.github.com/spec/"
 MOST_BYTES = 512 * 2**20  # of the arrays of an .npz file, unpacked: 16 million points with steps
 
 
-def refuse_special_file(name: str, path: Path, error: type[ChselError]) -> None:
+def refuse_special_file(name: str, path: Path, *, error: type[ChselError]) -> None:
     """Raise `error` if `path` is a FIFO, a socket or a device, a link to one, or of Git LFS.
 
     name: of the file in the message, such as "recording a.mcap". Other paths pass, also those that
@@ -154,7 +154,7 @@ def read_npz(
     accepted: names that the arrays may have (None: any). most_bytes: limit of all arrays, unpacked.
     Raises `error` with a message of one line for any defect of the file.
     """
-    refuse_special_file("it", path, error)
+    refuse_special_file("it", path, error=error)
     arrays: dict[str, np.ndarray[Any, Any]] = {}
     try:
         with zipfile.ZipFile(path) as archive:

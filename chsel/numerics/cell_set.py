@@ -39,14 +39,22 @@ class CellSet(NamedTuple):
 
 
 def box_of(
-    first: FloatArray, resolution: float, shape: Sequence[int], *, between: bool = False
+    first: FloatArray, resolution: float, *, shape: Sequence[int], between: bool = False
 ) -> Box:
     """Return the box of a grid of nodes (nx, ny, nz) whose first node is at `first` (3,)."""
     x, y, z = (int(count) for count in shape)
     last = first + (np.array([x, y, z]) - 1) * resolution
     most = triple(np.array([x, y, z]) - (2 if between else 1))
     down = 1.0 if between else 0.0
-    return Box(triple(first), triple(last), 1.0 / resolution, down, most, float(y * z), float(z))
+    return Box(
+        triple(first),
+        triple(last),
+        inverse=1.0 / resolution,
+        between=down,
+        most=most,
+        across=float(y * z),
+        along=float(z),
+    )
 
 
 def triple(values: Sequence[float] | FloatArray) -> tuple[float, float, float]:
@@ -57,7 +65,8 @@ def triple(values: Sequence[float] | FloatArray) -> tuple[float, float, float]:
 
 def cell_set_of(box: Box, cells: BoolArray) -> CellSet:
     """Return the set of the flagged cells (nx, ny, nz) of a box."""
-    halves, steps = np.empty(cells.shape, np.int64), np.empty(cells.size + 2, dtype=np.uint8)
+    halves = np.empty(cells.shape, np.int64)
+    steps = np.empty(cells.size + 2, dtype=np.uint8)
     squared_clearances(~cells, halves, 2)
     steps[:-2] = np.where(cells, 0, 1 + np.minimum(halves // 4, _MOST_STEPS)).reshape(-1)
     steps[-2:] = 0, 255
@@ -136,7 +145,7 @@ def set_voxels(points: FloatArray, first: FloatArray, side: float, flags: BoolAr
         flags[int(i) + 1, int(j) + 1, int(k) + 1] = True
 
 
-def voxels_of(points: FloatArray, first: FloatArray, side: float) -> IntArray:
+def voxels_of(points: FloatArray, first: FloatArray, *, side: float) -> IntArray:
     """Return indices (N, 3) of the voxels nearest to points (N, 3), ties to even.
 
     first (3,): centre of the voxel 0, 0, 0. side: of voxels, metres.
@@ -183,13 +192,16 @@ class Places(NamedTuple):
 def places_for(size: int) -> Places:
     """Return scratch for `size` points."""
     u, v, w = (np.empty(size) for _ in range(3))
-    return Places(np.empty(size), np.empty(size, dtype=np.int32), u, v, w)
+    return Places(np.empty(size), np.empty(size, dtype=np.int32), u=u, v=v, w=w)
 
 
 @inner
 def locate(move, box, x, y, z, places, count):
     """Fill the places of the first `count` points x, y, z moved by `move`; vectorised."""
-    first, last, most, inverse = box.first, box.last, box.most, box.inverse
+    first = box.first
+    last = box.last
+    most = box.most
+    inverse = box.inverse
     beyond, cell = places.beyond, places.cell
     u, v, w = places.u, places.v, places.w
     for n in range(count):
@@ -204,7 +216,9 @@ def locate(move, box, x, y, z, places, count):
         d = node_of(a, box.between, most[0])
         e = node_of(b, box.between, most[1])
         f = node_of(c, box.between, most[2])
-        u[n], v[n], w[n] = a - d, b - e, c - f
+        u[n] = a - d
+        v[n] = b - e
+        w[n] = c - f
         cell[n] = np.int32(d * box.across + e * box.along + f)
 
 

@@ -204,7 +204,8 @@ class _KernelCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any]) -> None:
         # Not numba's, which asks for the folder: it is not needed before the first call.
-        self._py_func, self._impl = function, _Results(function)
+        self._py_func = function
+        self._impl = _Results(function)
         self.enable()
 
     @property
@@ -321,7 +322,8 @@ class _CompilerWatch(event.Listener):
         if not _is_kernel(event):
             return
         if self._depth == 0:
-            self._usual, _config.SLP_VECTORIZE = _config.SLP_VECTORIZE, 1
+            self._usual = _config.SLP_VECTORIZE
+            _config.SLP_VECTORIZE = 1
             if self.show is not None:
                 self.show(self.count)
             elif not self._noticed:

@@ -40,7 +40,9 @@ def decompose(
 @inner
 def _rotate(work: FloatArray, vectors: FloatArray, p: int, q: int) -> bool:
     """Make entry (p, q) zero by a rotation; False if it is negligible beside the diagonal."""
-    off, a, b = work[p, q], work[p, p], work[q, q]
+    off = work[p, q]
+    a = work[p, p]
+    b = work[q, q]
     if abs(a) + abs(off) == abs(a) and abs(b) + abs(off) == abs(b):
         return False
     cotangent = (b - a) / (2.0 * off)  # of twice the angle

@@ -207,11 +207,17 @@ def _arctangent_of_ratio(small: float, big: float) -> tuple[float, float]:
     if 1e-100 < big < 1e100:
         scale = 1.0
     small, big = small * scale, big * scale
-    c, base, base_tail = 0.0, 0.0, 0.0
+    c = 0.0
+    base = 0.0
+    base_tail = 0.0
     if q > 0.75:
-        c, base, base_tail = 1.0, 0.5 * _HALF_PI, 0.5 * _HALF_PI_TAIL
+        c = 1.0
+        base = 0.5 * _HALF_PI
+        base_tail = 0.5 * _HALF_PI_TAIL
     elif q > 0.25:
-        c, base, base_tail = 0.5, _ARCTANGENT_HALF, _ARCTANGENT_HALF_TAIL
+        c = 0.5
+        base = _ARCTANGENT_HALF
+        base_tail = _ARCTANGENT_HALF_TAIL
     d = big + c * small
     r, r_tail = _quotient(small - c * big, d, (big - d) + c * small)
     z = r * r

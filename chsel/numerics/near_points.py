@@ -23,7 +23,8 @@ LANES = 8
 _SUBDIVISION = 4  # cells of the Morton order per spacing of the points, and a power of two
 _LEAST = 4  # points of a packet on average
 _HALF, _ONE = np.float32(0.5), np.float32(1.0)
-_ROW, _BLOCK = np.uint64(LANES), np.uint64(4 * LANES)
+_ROW = np.uint64(LANES)
+_BLOCK = np.uint64(4 * LANES)
 _U1, _U2, _U3, _U4, _U5, _U6, _U7 = (np.uint64(n) for n in range(1, 8))
 _UNIT = 2.0**-20  # 16 roundings of 32-bit numbers: more than are on the way to any coordinate
 _UNIT_64 = 1e-12  # more than all roundings of 64-bit numbers in a rigid motion
@@ -73,7 +74,8 @@ def point_tree(points: FloatArray, spacing: float) -> PointTree:
     levels = _levels(keys, bits)
     below = [*accumulate(map(len, levels[:-1])), 0]  # the number of the first child
     first = np.concatenate([level + np.int32(n) for level, n in zip(levels, below, strict=True)])
-    order, origin = keys & ((1 << bits) - 1), 0.5 * lower + 0.5 * upper
+    order = keys & ((1 << bits) - 1)
+    origin = 0.5 * lower + 0.5 * upper
     tree = PointTree(
         points=np.empty((3, count)),
         order=order,
@@ -143,8 +145,14 @@ def _spread_bits(cell):
 @compiled
 def _fill_blocks(points, tree):
     """Fill PointTree.points, blocks and offsets, axis by axis, from the points up."""
-    blocks, first, order, count = tree.blocks, tree.first, tree.order, len(tree.first)
-    low, high, squares = np.empty(count), np.empty(count), np.zeros(count)  # of boxes
+    blocks = tree.blocks
+    first = tree.first
+    order = tree.order
+    count = len(tree.first)
+    # of boxes
+    low = np.empty(count)
+    high = np.empty(count)
+    squares = np.zeros(count)
     for axis in range(3):
         placed, origin = tree.points[axis], tree.origin[axis]
         end = len(order)
@@ -160,7 +168,9 @@ def _fill_blocks(points, tree):
                     radius = np.sqrt(squares[child]) * (1.0 + 1e-6)
                     blocks[at + np.uint64(LANES * (3 - axis))] = np.float32(radius)
                 blocks[at] = np.float32(0.5 * a + 0.5 * b - origin)
-                least, most, at = min(least, a), max(most, b), at + np.uint64(1)
+                least = min(least, a)
+                most = max(most, b)
+                at = at + np.uint64(1)
             low[block], high[block] = least, most
             half = 0.5 * most - 0.5 * least
             squares[block] += half * half
@@ -193,7 +203,19 @@ def near_points_for(tree: PointTree, lists: int) -> NearPoints:
     most = LANES * (packets + 1)
     rows = np.empty((4, most), dtype=np.float32)
     nodes, cells, limits, hits = (np.empty(most, dtype=np.int32) for _ in range(4))
-    return NearPoints(x, y, z, radius, kept, number, rows, nodes, cells, limits, hits)
+    return NearPoints(
+        x,
+        y,
+        z=z,
+        radius=radius,
+        kept=kept,
+        number=number,
+        rows=rows,
+        nodes=nodes,
+        cells=cells,
+        limits=limits,
+        hits=hits,
+    )
 
 
 @leaf
@@ -228,8 +250,13 @@ def gather(tree, cells, to_cell, slack, near, n):
 
     to_cell: as to_cells makes it; slack includes its rounding.
     """
-    x, y, z, radius = near.rows[0], near.rows[1], near.rows[2], near.rows[3]
-    nodes, count, none = near.nodes, tree.roots, np.uint64(0)
+    x = near.rows[0]
+    y = near.rows[1]
+    z = near.rows[2]
+    radius = near.rows[3]
+    nodes = near.nodes
+    count = tree.roots
+    none = np.uint64(0)
     for at in range(np.uint64(count)):
         nodes[at] = at
     for _ in range(tree.depth):
@@ -275,7 +302,10 @@ def _copy(source, at, out, to):
 @leaf
 def _keep(nodes, begin, count, steps, near):
     """Keep those of some nodes that are near enough, in their order; returns how many."""
-    where, limits, kept, total = near.cells, near.limits, near.nodes, np.uint64(0)
+    where = near.cells
+    limits = near.limits
+    kept = near.nodes
+    total = np.uint64(0)
     for n in range(np.uint64(count)):
         kept[total] = nodes[begin + n]
         total += np.uint64(np.int32(steps[np.uint64(where[n])]) <= limits[n])
@@ -330,7 +360,10 @@ def select(tree, cells, to_cell, rounding, near, n):
 
     rounding: by how many metres it may move a point.
     """
-    steps, where, nodes, hits = cells.steps, near.cells, near.nodes, near.hits
+    steps = cells.steps
+    where = near.cells
+    nodes = near.nodes
+    hits = near.hits
     begin, count = np.uint64(n * tree.packets), near.number[n]
     _locate_spheres(
         near.x, near.y, near.z, near.radius, begin, count, to_cell, cells.box, rounding, near

@@ -65,7 +65,9 @@ def _gram_schmidt(x):
 def _planar(space, x):
     """Return R = Rot(a, theta) R_0 by Rodrigues' formula, t = o a + u e_u + v e_v."""
     sine, cosine = sine_cosine(x[0])
-    turn, squared, rest = space.turning, space.turning_squared, space.resting
+    turn = space.turning
+    squared = space.turning_squared
+    rest = space.resting
     back = 1.0 - cosine
     return (
         rest[0] + sine * turn[0] + back * squared[0],

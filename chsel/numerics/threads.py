@@ -13,7 +13,10 @@ from typing import Any
 from chsel.errors import EngineError, SettingError
 
 MOST_THREADS = 256  # of a process, or processes of a command; a larger number is a mistake
-_SMALLEST, _SMALL, _ONE, _TINY = 5e-324, 2.3e-308, 1.0, 2.0**-55
+_SMALLEST = 5e-324
+_SMALL = 2.3e-308
+_ONE = 1.0
+_TINY = 2.0**-55
 _PIECES_PER_THREAD = 4  # so that no thread waits long for another
 _setting = SimpleNamespace(count=None)
 
@@ -37,8 +40,8 @@ def require_ieee_arithmetic() -> None:
 def parallel_for(
     run: Callable[[int, int, Any], None],
     count: int,
-    scratch: Callable[[], Any],
     *,
+    scratch: Callable[[], Any],
     least: int = 1,
     multiple: int = 1,
 ) -> None:

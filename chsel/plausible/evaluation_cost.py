@@ -88,16 +88,18 @@ class EvaluationCost:
     def __init__(self, problem: RegistrationProblem, settings: EvaluationCostSettings) -> None:
         require_ieee_arithmetic()
         self.problem, self.settings = problem, settings
-        points, sdf, level = problem.points, problem.sdf, -settings.tolerance
+        points = problem.points
+        sdf = problem.sdf
+        level = -settings.tolerance
         counts = len(points.free), len(points.occupied), len(points.known)
         divided = settings.combine == "means"
         tree = point_tree(points.free, problem.free_resolution)
         voxels, point_in = _voxels(tree, problem.free_resolution)
         occupied = points.occupied if settings.occupied else np.zeros((0, 3))
         self.model = EvaluationModel(
-            field=distance_field(sdf, settings.lookup, settings.outside),
+            field=distance_field(sdf, settings.lookup, outside=settings.outside),
             tree=tree,
-            cells=cells_below(sdf, level + _LEVEL_ROUNDING, settings.lookup),
+            cells=cells_below(sdf, level + _LEVEL_ROUNDING, lookup=settings.lookup),
             occupied=occupied.T.copy(),
             known=points.known.T.copy(),
             known_sdf=points.sdf.copy(),
@@ -114,7 +116,9 @@ class EvaluationCost:
         poses = Poses.of(object_from_world)
         costs = np.empty(len(poses))
         run = partial(costs_below, self.model, poses.numbers, limit, costs)
-        parallel_for(run, len(poses), partial(scratch_for, self.model), least=_POSES_PER_THREAD)
+        parallel_for(
+            run, len(poses), scratch=partial(scratch_for, self.model), least=_POSES_PER_THREAD
+        )
         return costs
 
     def at(self, world_from_object: FloatArray) -> float:
@@ -134,12 +138,12 @@ def _voxels(tree: PointTree, resolution: float) -> tuple[Box, Any]:
     """Return the voxels of free points with an empty layer around, and a free point of each."""
     free = tree.points.T
     if len(free) == 0 or voxels_spanned(free, resolution) > _MOST_VOXELS:
-        return box_of(np.zeros(3), 1.0, (1, 1, 1)), np.full(1, -1, dtype=np.int32)
+        return box_of(np.zeros(3), 1.0, shape=(1, 1, 1)), np.full(1, -1, dtype=np.int32)
     first = free.min(axis=0) - resolution
-    voxels = voxels_of(free, first, resolution)
+    voxels = voxels_of(free, first, side=resolution)
     point_in = np.full(voxels.max(axis=0) + 2, -1, dtype=np.int32)
     point_in[tuple(voxels.T)] = np.arange(len(free))
-    return box_of(first, resolution, point_in.shape), point_in.reshape(-1)
+    return box_of(first, resolution, shape=point_in.shape), point_in.reshape(-1)
 
 
 class EvaluationScratch(NamedTuple):
@@ -156,8 +160,9 @@ def scratch_for(model: EvaluationModel) -> EvaluationScratch:
     """Return EvaluationScratch for one thread."""
     points = model.tree.points, model.occupied, model.known
     size = max(_MOST_DISTINCT, *(array.shape[1] for array in points))
-    near, (x, y, z) = near_points_for(model.tree, 1), np.empty((3, size))
-    return EvaluationScratch(near, x, y, z, places_for(size))
+    near = near_points_for(model.tree, 1)
+    (x, y, z) = np.empty((3, size))
+    return EvaluationScratch(near, x, y=y, z=z, places=places_for(size))
 
 
 @compiled
@@ -194,7 +199,10 @@ def _cost(model: EvaluationModel, free: int, occupied: int, total: float) -> flo
 @spliced
 def _known_sum(model: EvaluationModel, pose: Pose, scratch: EvaluationScratch) -> float:
     """Return sum |s - v| over the points of known signed distance, in their order."""
-    xs, ys, zs, total = model.known[0], model.known[1], model.known[2], 0.0
+    xs = model.known[0]
+    ys = model.known[1]
+    zs = model.known[2]
+    total = 0.0
     locate(pose, model.field.box, xs, ys, zs, scratch.places, len(xs))
     for n in range(len(xs)):
         s = distance_in_place(model.field, pose, xs[n], ys[n], zs[n], scratch.places, n)[0]
@@ -204,7 +212,10 @@ def _known_sum(model: EvaluationModel, pose: Pose, scratch: EvaluationScratch) -
 
 @spliced
 def _occupied_count(model: EvaluationModel, pose: Pose, scratch: EvaluationScratch) -> int:
-    xs, ys, zs, count = model.occupied[0], model.occupied[1], model.occupied[2], 0
+    xs = model.occupied[0]
+    ys = model.occupied[1]
+    zs = model.occupied[2]
+    count = 0
     locate(pose, model.field.box, xs, ys, zs, scratch.places, len(xs))
     for n in range(len(xs)):
         s = distance_in_place(model.field, pose, xs[n], ys[n], zs[n], scratch.places, n)[0]
@@ -215,7 +226,10 @@ def _occupied_count(model: EvaluationModel, pose: Pose, scratch: EvaluationScrat
 @spliced
 def _may_be_below(model, pose, occupied, total, limit, scratch):
     """Return False if the free points near some points inside of the object violate too often."""
-    voxels, inside, points, hits = model.voxels, model.inside, model.tree.points, 0
+    voxels = model.voxels
+    inside = model.inside
+    points = model.tree.points
+    hits = 0
     for n in range(inside.shape[1]):
         x, y, z = inside[0, n] - pose[9], inside[1, n] - pose[10], inside[2, n] - pose[11]
         x, y, z = turned_back(pose, x, y, z)
@@ -254,7 +268,10 @@ def _violates(model: EvaluationModel, places: Places, n: int) -> bool:
 
 @spliced
 def _free_count(model: EvaluationModel, pose: Pose, scratch: EvaluationScratch) -> int:
-    tree, cells, near, points = model.tree, model.cells, scratch.near, model.tree.points
+    tree = model.tree
+    cells = model.cells
+    near = scratch.near
+    points = model.tree.points
     to_cell, rounding = to_cells(tree, cells.box, pose)
     if rounding >= 0.0 and rigid(pose):
         gather(tree, cells, to_cell, rounding, near, 0)
@@ -265,7 +282,9 @@ def _free_count(model: EvaluationModel, pose: Pose, scratch: EvaluationScratch) 
             near.hits[n] = n
     for n in range(count):
         at = near.hits[n]
-        scratch.x[n], scratch.y[n], scratch.z[n] = points[0, at], points[1, at], points[2, at]
+        scratch.x[n] = points[0, at]
+        scratch.y[n] = points[1, at]
+        scratch.z[n] = points[2, at]
     locate(pose, cells.box, scratch.x, scratch.y, scratch.z, scratch.places, count)
     violations = 0
     for n in range(count):

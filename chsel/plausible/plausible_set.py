@@ -102,22 +102,22 @@ class PlausibleSet:
 
 
 def plausible_set(
-    problem: RegistrationProblem, world_from_object: FloatArray, settings: PlausibleSettings
+    problem: RegistrationProblem, world_from_object: FloatArray, *, settings: PlausibleSettings
 ) -> PlausibleSet:
     """Return the plausible set of a problem around the true pose (4, 4).
 
     What the true pose itself violates counts into C(X*), so that as much is allowed to others.
     Raises EvaluationError if there are more than MOST_MEMBERS members.
     """
-    truth = frozen("world_from_object", world_from_object, (4, 4), error=PoseError)
+    truth = frozen("world_from_object", world_from_object, shape=(4, 4), error=PoseError)
     check_rigid("world_from_object", truth[None])
     cost = EvaluationCost(problem, settings.cost)
     true_cost = cost.at(truth)
     limit = true_cost + settings.epsilon
     seed = rotation_seed(problem, settings)
-    grid = grid_around(truth, settings.grid, seed)
-    index, costs = scan_grid(cost, grid, limit)
-    kept = random_subset(len(index), settings.members - 1, plausible_stream(seed, 1))
+    grid = grid_around(truth, settings.grid, seed=seed)
+    index, costs = scan_grid(cost, grid, limit=limit)
+    kept = random_subset(len(index), settings.members - 1, stream=plausible_stream(seed, 1))
     poses = grid.poses(index[kept])
     others = ~(poses == truth).all(axis=(1, 2))  # a grid may hold the true pose itself
     members = PlausibleSet(
@@ -133,8 +133,8 @@ def plausible_set(
         sdf_digest=problem.sdf.digest,
     )
     if settings.modes is not None:
-        members = _with_modes(members, cost, grid, limit)
-    return _filled(members, cost, limit)
+        members = _with_modes(members, cost, grid=grid, limit=limit)
+    return _filled(members, cost, limit=limit)
 
 
 def rotation_seed(problem: RegistrationProblem, settings: PlausibleSettings) -> int:
@@ -143,7 +143,7 @@ def rotation_seed(problem: RegistrationProblem, settings: PlausibleSettings) -> 
 
 
 def _with_modes(
-    members: PlausibleSet, cost: EvaluationCost, grid: PoseGrid, limit: float
+    members: PlausibleSet, cost: EvaluationCost, *, grid: PoseGrid, limit: float
 ) -> PlausibleSet:
     """Return the set with members in modes that the grid passes by, in place of others if too many.
 
@@ -152,27 +152,32 @@ def _with_modes(
     Each is far from all members and from the other ones, the farthest first. No position is farther
     outside of the grid's than the separation.
     """
-    settings, sdf, seed = members.settings.modes, cost.problem.sdf, members.seed
+    settings = members.settings.modes
+    sdf = cost.problem.sdf
+    seed = members.seed
     assert settings is not None
-    starts = _nearly_plausible(grid, cost, members)
-    starts = starts[random_subset(len(starts), _CANDIDATES, plausible_stream(seed, _MODE_STREAM))]
+    starts = _nearly_plausible(grid, cost, members=members)
+    starts = starts[
+        random_subset(len(starts), _CANDIDATES, stream=plausible_stream(seed, _MODE_STREAM))
+    ]
     starts = starts[farthest_points(_places(starts, sdf), settings.starts)]
     if len(starts) == 0:
         return members
-    poses, costs = _climbed(cost, starts, limit, seed)
+    poses, costs = _climbed(cost, starts, limit=limit, seed=seed)
     lower = grid.positions.min(axis=0) - settings.separation
     upper = grid.positions.max(axis=0) + settings.separation
     inside = ((poses[:, :3, 3] >= lower) & (poses[:, :3, 3] <= upper)).all(axis=1)
     poses, costs = poses[inside], costs[inside]
-    most, count = members.settings.members, len(members.cost)
-    chosen = _far_from(members, poses, sdf, max(most - count, most // 2))
-    others = random_subset(count - 1, most - 1 - len(chosen), plausible_stream(seed, 1)) + 1
+    most = members.settings.members
+    count = len(members.cost)
+    chosen = _far_from(members, poses, sdf=sdf, most=max(most - count, most // 2))
+    others = random_subset(count - 1, most - 1 - len(chosen), stream=plausible_stream(seed, 1)) + 1
     kept = np.concatenate([[0], others])
     on_grid = replace(members, **{name: getattr(members, name)[kept] for name in _ARRAYS[:3]})
     return on_grid.with_members(poses[chosen], costs[chosen])
 
 
-def _filled(members: PlausibleSet, cost: EvaluationCost, limit: float) -> PlausibleSet:
+def _filled(members: PlausibleSet, cost: EvaluationCost, *, limit: float) -> PlausibleSet:
     """Return the set with members off the grid around others, where those of the grid are too few.
 
     Rounds of normal steps in position and rotation vector from members, those of earlier rounds
@@ -189,14 +194,19 @@ def _filled(members: PlausibleSet, cost: EvaluationCost, limit: float) -> Plausi
         wanted = min((_PER_MODE - 1) * len(around), settings.fill_to - len(around), left)
     if wanted <= 0:
         return members
-    known, pool, costs, scale = len(around), around, np.zeros(0), 1.0
+    known = len(around)
+    pool = around
+    costs = np.zeros(0)
+    scale = 1.0
     for n in range(_MOST_ROUNDS):
         if n == _ROUNDS and len(costs) >= wanted:
             break
         stream = plausible_stream(members.seed, 2 + n)
         steps = normals(stream, (_DRAWN, 6)) * scale
-        starts = pool[np.floor(uniforms(stream, 0.0, float(len(pool)), _DRAWN)).astype(int)]
-        drawn = stepped(starts, _POSITION * steps[:, :3], _ANGLE * steps[:, 3:])
+        starts = pool[
+            np.floor(uniforms(stream, 0.0, upper=float(len(pool)), shape=_DRAWN)).astype(int)
+        ]
+        drawn = stepped(starts, _POSITION * steps[:, :3], turns=_ANGLE * steps[:, 3:])
         drawn_costs = cost.evaluate(inverse(drawn), limit=limit)
         good = drawn_costs < limit
         pool = np.concatenate([pool, drawn[good]])
@@ -210,15 +220,15 @@ def _filled(members: PlausibleSet, cost: EvaluationCost, limit: float) -> Plausi
     return members.with_members(pool[chosen], costs[chosen - known])
 
 
-def random_subset(count: int, most: int, stream: np.random.Generator) -> IntArray:
+def random_subset(count: int, most: int, *, stream: np.random.Generator) -> IntArray:
     """Return at most so many of the numbers below `count`, drawn at random, ascending."""
     if count <= most:
         return np.arange(count)
-    drawn = uniforms(stream, 0.0, 1.0, count)
+    drawn = uniforms(stream, 0.0, upper=1.0, shape=count)
     return np.sort(np.argsort(drawn, kind="stable")[:most])
 
 
-def stepped(poses: FloatArray, shifts: FloatArray, turns: FloatArray) -> FloatArray:
+def stepped(poses: FloatArray, shifts: FloatArray, *, turns: FloatArray) -> FloatArray:
     """Return poses (..., 4, 4) shifted (..., 3), and turned about their origins (..., 3).
 
     The latter are rotation vectors about the axes of the world.
@@ -233,7 +243,7 @@ def _places(poses: FloatArray, sdf: SdfGrid) -> FloatArray:
     return np.concatenate([poses[:, :3, 3], lever * poses[:, :3, :3].reshape(-1, 9)], axis=1)
 
 
-def _nearly_plausible(grid: PoseGrid, cost: EvaluationCost, members: PlausibleSet) -> FloatArray:
+def _nearly_plausible(grid: PoseGrid, cost: EvaluationCost, *, members: PlausibleSet) -> FloatArray:
     """Return poses (N, 4, 4) of a grid to climb from, of as many of its rotations as give enough.
 
     They cost at most `distance` more than the true pose: the mean over known points, and a
@@ -247,17 +257,22 @@ def _nearly_plausible(grid: PoseGrid, cost: EvaluationCost, members: PlausibleSe
     relaxed = EvaluationCost(cost.problem, changes)
     limit = relaxed.at(members.truth) + settings.distance
     most = max(1, MOST_MEMBERS // len(grid.positions))
-    poses, count, first, size = [], 0, 0, min(_FIRST_ROTATIONS, most)
+    poses = []
+    count = 0
+    first = 0
+    size = min(_FIRST_ROTATIONS, most)
     while first < len(grid.rotations) and count < _CANDIDATES:
         part = replace(grid, rotations=grid.rotations[first : first + size])
-        index, _ = scan_grid(relaxed, part, limit)
+        index, _ = scan_grid(relaxed, part, limit=limit)
         poses.append(part.poses(index))
-        count, first, size = count + len(index), first + size, min(2 * size, most)
+        count = count + len(index)
+        first = first + size
+        size = min(2 * size, most)
     return np.concatenate(poses)
 
 
 def _climbed(
-    cost: EvaluationCost, starts: FloatArray, limit: float, seed: int
+    cost: EvaluationCost, starts: FloatArray, *, limit: float, seed: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return members (M, 4, 4) reached from poses (N, 4, 4), world_from_object, and costs (M,).
 
@@ -273,11 +288,12 @@ def _climbed(
             break
         stream = plausible_stream(seed, _MODE_STREAM + 2 + n)
         steps = normals(stream, (len(climbing), _CLIMB_DRAWN, 6)) * scale[climbing, None, None]
-        steps *= uniforms(stream, 0.05, 1.0, (len(climbing), _CLIMB_DRAWN, 1))
+        steps *= uniforms(stream, 0.05, upper=1.0, shape=(len(climbing), _CLIMB_DRAWN, 1))
         shifts, turns = _CLIMB_POSITION * steps[..., :3], _CLIMB_ANGLE * steps[..., 3:]
-        drawn = stepped(poses[climbing, None], shifts, turns)
+        drawn = stepped(poses[climbing, None], shifts, turns=turns)
         drawn_costs = cost.evaluate(inverse(drawn).reshape(-1, 4, 4)).reshape(-1, _CLIMB_DRAWN)
-        rows, best = np.arange(len(climbing)), np.argmin(drawn_costs, axis=1)
+        rows = np.arange(len(climbing))
+        best = np.argmin(drawn_costs, axis=1)
         better = drawn_costs[rows, best] < costs[climbing]
         scale[climbing[~better]] *= _CLIMB_SHRINK
         poses[climbing[better]] = drawn[rows, best][better]
@@ -301,17 +317,23 @@ def _descended(cost: EvaluationCost, starts: FloatArray) -> FloatArray:
         objective = Objective(CompiledCost.of(cost.problem, smooth), SE3Space())
     poses = Poses.of(inverse(starts))
     for rate in _RATES:
-        vectors = objective.descended(objective.space.encode(poses), 1.0, rate, _ITERATIONS)
+        vectors = objective.descended(
+            objective.space.encode(poses), 1.0, rate=rate, iterations=_ITERATIONS
+        )
         poses = objective.space.poses(vectors)
     return poses.world_from_object
 
 
-def _far_from(members: PlausibleSet, poses: FloatArray, sdf: SdfGrid, most: int) -> IntArray:
+def _far_from(members: PlausibleSet, poses: FloatArray, *, sdf: SdfGrid, most: int) -> IntArray:
     """Return indices of poses (N, 4, 4) far from members and each other, the farthest first."""
     assert members.settings.modes is not None
     least = SQUARE_MILLIMETRES * members.settings.modes.separation**2
-    points = surface_points(sdf, _SURFACE_POINTS, plausible_stream(members.seed, _MODE_STREAM + 1))
-    distance = SurfaceDistance(sdf, None, points, DistanceSettings(_SURFACE_POINTS, "grid"))
+    points = surface_points(
+        sdf, _SURFACE_POINTS, stream=plausible_stream(members.seed, _MODE_STREAM + 1)
+    )
+    distance = SurfaceDistance(
+        sdf, None, points=points, settings=DistanceSettings(_SURFACE_POINTS, "grid")
+    )
     nearest = distance.between(inverse(members.world_from_object), poses).min(axis=0)
     chosen: list[int] = []
     while len(chosen) < min(most, len(poses)) and nearest.max() > least:
@@ -322,16 +344,19 @@ def _far_from(members: PlausibleSet, poses: FloatArray, sdf: SdfGrid, most: int)
     return np.array(chosen, dtype=np.int64)
 
 
-def plausible_path(folder: Path, problem: RegistrationProblem, settings: PlausibleSettings) -> Path:
+def plausible_path(
+    folder: Path, problem: RegistrationProblem, *, settings: PlausibleSettings
+) -> Path:
     """Return the path of a problem's set: FOLDER/<points digest>_<definition digest>.npz."""
     seed = rotation_seed(problem, settings)
-    return folder / _name(problem.points.digest, settings, seed, problem.sdf.digest)
+    return folder / _name(problem.points.digest, settings, seed=seed, sdf=problem.sdf.digest)
 
 
 def save_plausible(folder: Path, members: PlausibleSet) -> Path:
     """Write a set into a folder, under the name by which `load_plausible` finds it."""
-    name = _name(members.points_digest, members.settings, members.seed, members.sdf_digest)
-    path, beside = folder / name, folder / f".{name}.{os.urandom(4).hex()}"
+    name = _name(members.points_digest, members.settings, seed=members.seed, sdf=members.sdf_digest)
+    path = folder / name
+    beside = folder / f".{name}.{os.urandom(4).hex()}"
     arrays: dict[str, Any] = {n: getattr(members, n) for n in (*_ARRAYS, *_NUMBERS, "digest")}
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -349,8 +374,8 @@ def save_plausible(folder: Path, members: PlausibleSet) -> Path:
 def load_plausible(
     folder: Path,
     problem: RegistrationProblem,
-    settings: PlausibleSettings,
     *,
+    settings: PlausibleSettings,
     world_from_object: FloatArray | None = None,
 ) -> PlausibleSet | None:
     """Return the stored set of a problem by a definition, around a true pose if given; else None.
@@ -358,11 +383,11 @@ def load_plausible(
     Raises EvaluationError for a file under that name that is damaged, of other points or another
     definition, or around another true pose.
     """
-    path = plausible_path(folder, problem, settings)
+    path = plausible_path(folder, problem, settings=settings)
     if not path.exists():
         return None
     members = read_plausible(path)
-    name = _name(members.points_digest, members.settings, members.seed, members.sdf_digest)
+    name = _name(members.points_digest, members.settings, seed=members.seed, sdf=members.sdf_digest)
     moved = world_from_object is not None and not (members.truth == world_from_object).all()
     if moved or name != path.name:
         raise EvaluationError(
@@ -379,7 +404,7 @@ def read_plausible(path: Path) -> PlausibleSet:
         settings = json.loads(str(arrays["settings"]))
         values: dict[str, Any] = {name: arrays[name] for name in _ARRAYS}
         values |= {name: arrays[name].item() for name in _NUMBERS}
-        values["settings"] = build_settings(PlausibleSettings, settings, "settings")
+        values["settings"] = build_settings(PlausibleSettings, settings, where="settings")
         members = PlausibleSet(**values)
     except (ChselError, KeyError, ValueError) as error:
         text = " ".join(str(error).split())
@@ -395,7 +420,7 @@ def read_plausible(path: Path) -> PlausibleSet:
     return members
 
 
-def _name(points: str, settings: PlausibleSettings, seed: int, sdf: str) -> str:
+def _name(points: str, settings: PlausibleSettings, *, seed: int, sdf: str) -> str:
     text = "|".join([settings.digest, str(seed), sdf])
     definition = digest(np.frombuffer(text.encode(), dtype=np.uint8))
     return f"{points}_{definition}.npz"

@@ -57,7 +57,7 @@ class Offsets:
             raise SettingError(
                 f"offsets are {counts} along x, y and z; accepted: at least one along each"
             )
-        require_at_most("the number of offsets", math.prod(counts), MOST_POSITIONS)
+        require_at_most("the number of offsets", math.prod(counts), most=MOST_POSITIONS)
 
     def points(self) -> FloatArray:
         """Return the offsets (P, 3), those along z fastest."""
@@ -133,7 +133,7 @@ def plausible_settings(definition: str, epsilon: float) -> PlausibleSettings:
     by sums as the paper's Eq. 2; no free point may be inside of a member. "wide_means_10mm":
     free points may be 10 mm deep inside of a member, as in the authors' code.
     """
-    require_choice("definition", definition, DEFINITIONS)
+    require_choice("definition", definition, accepted=DEFINITIONS)
     default = PlausibleSettings(epsilon=epsilon)
     if definition == "paper":
         cost = EvaluationCostSettings("sums", tolerance=0.0, lookup="nearest")
@@ -151,7 +151,7 @@ def plausible_settings(definition: str, epsilon: float) -> PlausibleSettings:
         tolerance = 0.01 if definition == "wide_means_10mm" else 0.0
         cost = EvaluationCostSettings(combine, tolerance=tolerance, lookup="trilinear")
         sides = ((-0.5, 0.5, 36),)
-        grid = PoseGridSettings(Offsets(sides, sides, ((-0.3, 0.5, 29),)))
+        grid = PoseGridSettings(Offsets(sides, sides, z=((-0.3, 0.5, 29),)))
         modes = ModeSearchSettings(starts=8000)
         return replace(default, cost=cost, grid=grid, fill_to=300, modes=modes)
     return default

@@ -18,7 +18,7 @@ from chsel.problem.surface import outline_distances_to
 
 
 def pose_errors(
-    object_from_world: FloatArray, world_from_object: FloatArray, symmetry: ObjectSymmetry
+    object_from_world: FloatArray, world_from_object: FloatArray, *, symmetry: ObjectSymmetry
 ) -> tuple[FloatArray, FloatArray]:
     """Return position errors (B,) in metres and rotation errors (B,) in radians, modulo symmetries.
 
@@ -34,23 +34,27 @@ def pose_errors(
     return distance, symmetry.rotation_errors(relative)
 
 
-def closest_pose(object_from_world: FloatArray, world_from_object: FloatArray, sdf: SdfGrid) -> int:
+def closest_pose(
+    object_from_world: FloatArray, world_from_object: FloatArray, *, sdf: SdfGrid
+) -> int:
     """Return the index of the hypothesis (B, 4, 4), B > 0, closest to the true pose (4, 4).
 
     It is by `outline_distances_to`, so that poses that look the same are as close. Those that no
     kernel can read are left out; the first of equal ones.
     """
-    poses, truth = Poses.of(object_from_world), Poses.of(inverse(world_from_object)[None])
+    poses = Poses.of(object_from_world)
+    truth = Poses.of(inverse(world_from_object)[None])
     readable = (np.abs(poses.numbers) <= FARTHEST).all(axis=1)
     readable &= (np.abs(truth.numbers) <= FARTHEST).all()
     distances = np.full(len(poses), np.inf)
-    distances[readable] = outline_distances_to(sdf, poses[readable], truth)
+    distances[readable] = outline_distances_to(sdf, poses[readable], other=truth)
     return int(np.argmin(distances))
 
 
 def result_numbers(
     hypotheses: Hypotheses,
     problem: RegistrationProblem,
+    *,
     world_from_object: FloatArray | None,
     symmetry: ObjectSymmetry | None,
     trust: Trust | None = None,
@@ -72,8 +76,10 @@ def result_numbers(
         values |= trust.numbers
     if world_from_object is not None and len(hypotheses.object_from_world) > 0:
         symmetry = symmetry or grid_symmetry(problem.sdf)
-        position, rotation = pose_errors(hypotheses.object_from_world, world_from_object, symmetry)
-        closest = closest_pose(hypotheses.object_from_world, world_from_object, problem.sdf)
+        position, rotation = pose_errors(
+            hypotheses.object_from_world, world_from_object, symmetry=symmetry
+        )
+        closest = closest_pose(hypotheses.object_from_world, world_from_object, sdf=problem.sdf)
         for name, index in (("best", 0), ("closest", closest)):
             values[f"{name}_position_error"] = float(position[index])
             values[f"{name}_rotation_error"] = float(rotation[index])
@@ -120,7 +126,7 @@ def plausible_diversity(distances: FloatArray) -> PlausibleDiversity:
 
 
 def true_pose_rank(
-    distance: SurfaceDistance, object_from_world: FloatArray, world_from_object: FloatArray
+    distance: SurfaceDistance, object_from_world: FloatArray, *, world_from_object: FloatArray
 ) -> float:
     """Return the share of true pose (4, 4) and hypotheses (B, 4, 4) at least as far out as it.
 

@@ -89,7 +89,7 @@ class PoseGrid:
         return len(self.positions) * len(self.rotations)
 
 
-def grid_around(truth: FloatArray, settings: PoseGridSettings, seed: int) -> PoseGrid:
+def grid_around(truth: FloatArray, settings: PoseGridSettings, *, seed: int) -> PoseGrid:
     """Return the grid of a definition around the true pose (4, 4), world_from_object.
 
     Its rotations are the same at every step of a session.
@@ -106,15 +106,16 @@ def grid_around(truth: FloatArray, settings: PoseGridSettings, seed: int) -> Pos
         else:
             parts = [rotations, upright, true]
         rotations = np.concatenate(parts)
-    return PoseGrid(truth[:3, 3], settings.offsets, rotations)
+    return PoseGrid(truth[:3, 3], settings.offsets, rotations=rotations)
 
 
-def scan_grid(cost: EvaluationCost, grid: PoseGrid, limit: float) -> tuple[IntArray, FloatArray]:
+def scan_grid(cost: EvaluationCost, grid: PoseGrid, *, limit: float) -> tuple[IntArray, FloatArray]:
     """Return numbers and costs (G,) of all poses of a grid that cost less than a limit, ascending.
 
     Raises EvaluationError if there are more than MOST_MEMBERS.
     """
-    points, count = cost.problem.points, len(grid.positions)
+    points = cost.problem.points
+    count = len(grid.positions)
     order = _most_informative_first(points.known)
     margin = _ROUNDING * (limit * cost.model.divisors.known + np.abs(points.sdf).sum())
     scan = Scan(
@@ -150,7 +151,7 @@ def scan_grid(cost: EvaluationCost, grid: PoseGrid, limit: float) -> tuple[IntAr
             cost=np.empty(count + _CAPACITY),
         )
 
-    parallel_for(run, len(grid.rotations), make_buffer, least=_ROTATIONS_PER_THREAD)
+    parallel_for(run, len(grid.rotations), scratch=make_buffer, least=_ROTATIONS_PER_THREAD)
     pieces = [piece for first in sorted(found) for piece in found[first]]
     index = np.concatenate([piece[0] for piece in pieces])
     if len(index) > MOST_MEMBERS:
@@ -166,7 +167,9 @@ def scan_grid(cost: EvaluationCost, grid: PoseGrid, limit: float) -> tuple[IntAr
 def _most_informative_first(known: FloatArray) -> IntArray:
     """Return known points, each far from those before it, then at random: to reject poses early."""
     first = farthest_points(known, _MOST_INFORMATIVE)
-    rest = np.argsort(uniforms(plausible_stream(0), 0.0, 1.0, len(known)), kind="stable")
+    rest = np.argsort(
+        uniforms(plausible_stream(0), 0.0, upper=1.0, shape=len(known)), kind="stable"
+    )
     return np.concatenate([first, rest[~np.isin(rest, first)]])
 
 
@@ -230,7 +233,10 @@ def scan_rotations(scan: Scan, first: int, last: int, buffer: ScanBuffer) -> tup
     number of poses in the buffer.
     """
     known, positions = scan.known, scan.positions
-    points, shifts, total, count = buffer.points, buffer.shifts, buffer.total, 0
+    points = buffer.points
+    shifts = buffer.shifts
+    total = buffer.total
+    count = 0
     for n in range(first, last):
         if len(buffer.pose) - count < len(positions):
             return n, count
@@ -274,9 +280,16 @@ def _may_be_below(scan: Scan, buffer: ScanBuffer, start: int) -> bool:
 @leaf
 def _add_bounds(scan: Scan, buffer: ScanBuffer, start: int, m: int) -> None:
     """Add what the m-th known point costs at least at positions from `start` on."""
-    box, bounds, shifts = scan.model.field.box, scan.bounds, buffer.shifts
-    beyond, cell, total = buffer.beyond, buffer.cell, buffer.total
-    first, last, most, inverse = box.first, box.last, box.most, box.inverse
+    box = scan.model.field.box
+    bounds = scan.bounds
+    shifts = buffer.shifts
+    beyond = buffer.beyond
+    cell = buffer.cell
+    total = buffer.total
+    first = box.first
+    last = box.last
+    most = box.most
+    inverse = box.inverse
     x, y, z = buffer.points[0, m], buffer.points[1, m], buffer.points[2, m]
     us, vs, ws = shifts[0, start:], shifts[1, start:], shifts[2, start:]
     for i in range(_LANES):
@@ -324,7 +337,7 @@ class TruePose(NamedTuple):
 
 
 def find_true_pose(
-    problem: RegistrationProblem, guess: FloatArray, settings: TruePoseSettings | None = None
+    problem: RegistrationProblem, guess: FloatArray, *, settings: TruePoseSettings | None = None
 ) -> TruePose:
     """Return the pose of least evaluation cost near a guess, world_from_object (4, 4).
 
@@ -332,30 +345,32 @@ def find_true_pose(
     So the authors made T* of real data from a pose set by hand; plausible sets are around it.
     """
     settings = settings or TruePoseSettings()
-    guess = frozen("guess", guess, (4, 4), error=PoseError)
+    guess = frozen("guess", guess, shape=(4, 4), error=PoseError)
     best = nearest_rigid("guess", guess[None])[0]
     cost = EvaluationCost(problem, settings.cost)
     least = guess_cost = cost.at(best)
-    reach, spacing, angle = settings.reach, settings.spacing, settings.angle
+    reach = settings.reach
+    spacing = settings.spacing
+    angle = settings.angle
     for n in range(settings.passes):
         half = round(reach / spacing)
         axis = ((-half * spacing, half * spacing, 2 * half + 1),)
         stream = problem.key.stream(Purpose.PLAUSIBLE_ROTATIONS, _STREAM + n)
         turns = rotation_vector(angle * normals(stream, (settings.rotations, 3)))
         rotations = np.concatenate([best[None, :3, :3], product(turns, best[:3, :3])])
-        grid = PoseGrid(best[:3, 3], Offsets(axis, axis, axis), rotations)
-        best, least = _best(cost, grid, best, least)
+        grid = PoseGrid(best[:3, 3], Offsets(axis, axis, z=axis), rotations=rotations)
+        best, least = _best(cost, grid, best=best, least=least)
         reach, spacing, angle = spacing, spacing * spacing / reach, angle * spacing / reach
-    return TruePose(best, least, guess_cost)
+    return TruePose(best, least, guess_cost=guess_cost)
 
 
 def _best(
-    cost: EvaluationCost, grid: PoseGrid, best: FloatArray, least: float
+    cost: EvaluationCost, grid: PoseGrid, *, best: FloatArray, least: float
 ) -> tuple[FloatArray, float]:
     """Return the cheapest pose of a grid and its cost; the best one before if none is cheaper."""
     look = np.arange(0, len(grid), max(1, len(grid) // _FIRST_LOOK))
     look_costs = cost.evaluate(inverse(grid.poses(look)))
-    index, costs = scan_grid(cost, grid, min(least, float(look_costs.min())))
+    index, costs = scan_grid(cost, grid, limit=min(least, float(look_costs.min())))
     if len(index) == 0:  # none is cheaper than those
         index, costs = look, look_costs
     cheapest = int(np.argmin(costs))

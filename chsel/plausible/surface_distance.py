@@ -54,6 +54,7 @@ class SurfaceDistance:
         self,
         sdf: SdfGrid,
         mesh: trimesh.Trimesh | None,
+        *,
         points: FloatArray,
         settings: DistanceSettings | None = None,
     ) -> None:
@@ -67,7 +68,7 @@ class SurfaceDistance:
         if mesh is None and settings.method != "grid":
             raise SettingError(f"method {settings.method} needs a mesh; accepted without: grid")
         self._points = np.ascontiguousarray(points.T)
-        self._field = distance_field(sdf, "trilinear", "surface_point")
+        self._field = distance_field(sdf, "trilinear", outside="surface_point")
         if mesh is not None:
             self._vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
             self._faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
@@ -83,22 +84,24 @@ class SurfaceDistance:
         if self.settings.method == "exact":
             count, other = len(to_object), len(to_world)
             rows, columns = np.indices((count, other)).reshape(2, -1)
-            return self._exact(to_object, to_world, rows, columns).reshape(count, other)
+            return self._exact(to_object, to_world, rows=rows, columns=columns).reshape(
+                count, other
+            )
         distances = self._by_grid(Poses.of(to_object).numbers, Poses.of(to_world).numbers)
         if self.settings.method == "nearest" and distances.size:
             rows, columns = _nearest(distances)
-            distances[rows, columns] = self._exact(to_object, to_world, rows, columns)
+            distances[rows, columns] = self._exact(to_object, to_world, rows=rows, columns=columns)
         return distances
 
     def _by_grid(self, to_object: FloatArray, to_world: FloatArray) -> FloatArray:
         """Return distances (B, P) by the grid, of poses (B, 12) and (P, 12)."""
         total = np.empty((len(to_object), len(to_world)))
         run = partial(fill_mean_squares, self._field, self._points, to_object, to_world, total)
-        parallel_for(run, len(total), lambda: places_for(self._points.shape[1]))
+        parallel_for(run, len(total), scratch=lambda: places_for(self._points.shape[1]))
         return total * SQUARE_MILLIMETRES
 
     def _exact(
-        self, to_object: FloatArray, to_world: FloatArray, rows: IntArray, columns: IntArray
+        self, to_object: FloatArray, to_world: FloatArray, *, rows: IntArray, columns: IntArray
     ) -> FloatArray:
         """Return distances (N,) to the mesh of pairs of poses (B, 4, 4) and (P, 4, 4)."""
         total = np.zeros(len(rows))
@@ -115,12 +118,12 @@ class SurfaceDistance:
         return total * SQUARE_MILLIMETRES
 
 
-def surface_points(mesh: trimesh.Trimesh, count: int, key: StreamKey) -> FloatArray:
+def surface_points(mesh: trimesh.Trimesh, count: int, *, key: StreamKey) -> FloatArray:
     """Return points (count, 3) spread over the surface of a mesh at random, uniformly by area."""
     corners = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)]
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     areas = np.sqrt((np.cross(b - a, c - a) ** 2).sum(axis=1))
-    drawn = uniforms(key.stream(Purpose.METRIC_POINTS), 0.0, 1.0, (count, 3))
+    drawn = uniforms(key.stream(Purpose.METRIC_POINTS), 0.0, upper=1.0, shape=(count, 3))
     until = np.cumsum(areas)
     face = np.searchsorted(until, drawn[:, 0] * until[-1], side="right")
     face = np.minimum(face, len(areas) - 1)

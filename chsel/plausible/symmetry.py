@@ -88,7 +88,7 @@ def object_symmetry(mesh: trimesh.Trimesh) -> ObjectSymmetry:
             symmetry = ObjectSymmetry(surface.centre, sphere=True)
         elif len(axes) == 1:
             half_turn = _half_turn_across(surface, axes[0])
-            symmetry = ObjectSymmetry(surface.centre, half_turn, axes[0])
+            symmetry = ObjectSymmetry(surface.centre, half_turn, axis=axes[0])
         elif surface.radius > 0.0:
             symmetry = ObjectSymmetry(surface.centre, _finite_group(surface))
         else:
@@ -122,11 +122,13 @@ class RotatedSurface:
         import igl
         import trimesh
 
-        vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
+        vertices = np.asarray(mesh.vertices, dtype=np.float64)
+        faces = np.asarray(mesh.faces)
         corners = vertices[faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         areas = np.sqrt((normals**2).sum(axis=1))  # twice the areas of faces
-        self.centre, self.radius = corners.reshape(-1, 3).mean(axis=0), 0.0
+        self.centre = corners.reshape(-1, 3).mean(axis=0)
+        self.radius = 0.0
         if not areas.sum() > 0.0:
             return
         self.centre = (areas[:, None] * corners.mean(axis=1)).sum(axis=0) / areas.sum()
@@ -137,7 +139,7 @@ class RotatedSurface:
         self._vertices = np.ascontiguousarray((vertices - self.centre) / self.radius)
         self._faces = np.ascontiguousarray(faces, dtype=np.int64)
         unit = trimesh.Trimesh(self._vertices, self._faces, process=False)
-        self._points = surface_points(unit, _POINTS, StreamKey(0, 0))  # (P, 3)
+        self._points = surface_points(unit, _POINTS, key=StreamKey(0, 0))  # (P, 3)
         self._tree = igl.AABB()
         self._tree.init(self._vertices, self._faces)
 
@@ -242,10 +244,10 @@ def _finite_group(surface: RotatedSurface) -> FloatArray:
     least = np.flatnonzero((coarse <= coarse[neighbours].min(axis=1)) & (coarse <= _COARSE))
     least = least[np.argsort(coarse[least], kind="stable")][:_MOST_CANDIDATES]
     turns = surface.aligned(spread[least], steps=4, count=64)
-    turns = _distinct(_best_first(turns, surface.errors(turns, count=200), 3.0), _MOST_ALIGNED)
+    turns = _distinct(_best_first(turns, surface.errors(turns, count=200), most=3.0), _MOST_ALIGNED)
     turns = surface.aligned(turns, steps=12, count=500)
     group = np.eye(3)[None]
-    for turn in _best_first(turns, surface.errors(turns), 1.0):
+    for turn in _best_first(turns, surface.errors(turns), most=1.0):
         if _angles_between(turn[None], group).min() > _SAME:
             larger = generated(np.array([*group, turn]))
             if larger is not None and surface.errors(larger).max() <= 1.0:
@@ -254,7 +256,7 @@ def _finite_group(surface: RotatedSurface) -> FloatArray:
     return group if improved is None else improved
 
 
-def _best_first(turns: FloatArray, errors: FloatArray, most: float) -> FloatArray:
+def _best_first(turns: FloatArray, errors: FloatArray, *, most: float) -> FloatArray:
     """Return rotations (T, 3, 3) with errors (T,) of at most so much, the best first."""
     order = np.argsort(errors, kind="stable")
     return turns[order[errors[order] <= most]]
@@ -267,8 +269,10 @@ def _spread() -> tuple[FloatArray, IntArray]:
     Alexa, 2022, "Super-Fibonacci spirals: fast, low-discrepancy sampling of SO(3)".
     """
     at = np.arange(_SPREAD) + 0.5
-    inner, outer = np.sqrt(at / _SPREAD), np.sqrt(1.0 - at / _SPREAD)
-    first, second = 2.0 * np.pi * at / np.sqrt(2.0), 2.0 * np.pi * at / 1.533751168755204288
+    inner = np.sqrt(at / _SPREAD)
+    outer = np.sqrt(1.0 - at / _SPREAD)
+    first = 2.0 * np.pi * at / np.sqrt(2.0)
+    second = 2.0 * np.pi * at / 1.533751168755204288
     pairs = [(inner, np.sin(first)), (inner, np.cos(first))]
     pairs += [(outer, np.sin(second)), (outer, np.cos(second))]
     quaternion = np.array([radius * share for radius, share in pairs]).T

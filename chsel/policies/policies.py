@@ -25,7 +25,7 @@ def grid(problem: DecisionProblem, forecast: Forecast) -> FloatArray:
 
 def random(problem: DecisionProblem, forecast: Forecast) -> FloatArray:
     """Return numbers (A,), uniform in [0, 1), from the problem's stream."""
-    return uniforms(problem.key.stream(Purpose.POLICY), 0.0, 1.0, len(problem.actions))
+    return uniforms(problem.key.stream(Purpose.POLICY), 0.0, upper=1.0, shape=len(problem.actions))
 
 
 def nearest_mean(problem: DecisionProblem, forecast: Forecast) -> FloatArray:
@@ -94,7 +94,7 @@ _OURS: dict[str, Entry[Policy]] = {
 }
 OURS = tuple(_OURS)
 _CHOICES = NamedChoices[Policy](
-    "policy", "chsel.policies", "docs/writing_a_policy.md", _OURS, _lacks
+    "policy", "chsel.policies", page="docs/writing_a_policy.md", ours=_OURS, lacks=_lacks
 )
 POLICIES = _CHOICES.names
 build_policy, policy_settings = _CHOICES.build, _CHOICES.settings

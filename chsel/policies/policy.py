@@ -39,7 +39,7 @@ class StopSettings(CheckedSettings):
     # Promised by the best action, at least, metres; None: LEAST_GAIN diameters of the object.
     gain: Annotated[float | None, not_negative] = None
 
-    def is_narrow(self, spread: float, diameter: float, verdict: str) -> bool:
+    def is_narrow(self, spread: float, diameter: float, *, verdict: str) -> bool:
         """Whether to stop by the spread of a belief, metres, on an object of a diameter, metres.
 
         verdict: on the result that the belief is of, "" if there is none.
@@ -98,22 +98,30 @@ class ConfiguredPolicy(Generic[Settings]):
         if self.is_gain and problem.actions.seconds is not None:
             rating = rating / problem.actions.seconds
         feasible = problem.available & (forecast.blocked_chance <= self.settings.blocked)
-        stop = self._stop(problem, forecast, feasible)
+        stop = self._stop(problem, forecast, feasible=feasible)
         score = np.where(feasible, rating, -inf)
         chosen = -1 if stop else int(np.argmax(score))
         contacts = np.zeros((0, 3))
         if chosen >= 0:
             met = forecast.hit[:, chosen, None]
             contacts = np.where(met, forecast.first.contact[:, chosen], np.nan)
-        chances = forecast.hit_chance, forecast.blocked_chance, forecast.gains.expected_spread
-        return Decision(chosen, stop, forecast.spread, score, *chances, contacts)
+        return Decision(
+            chosen=chosen,
+            stop=stop,
+            spread=forecast.spread,
+            score=score,
+            hit_chance=forecast.hit_chance,
+            blocked_chance=forecast.blocked_chance,
+            expected_spread=forecast.gains.expected_spread,
+            contacts=contacts,
+        )
 
-    def _stop(self, problem: DecisionProblem, forecast: Forecast, feasible: BoolArray) -> str:
+    def _stop(self, problem: DecisionProblem, forecast: Forecast, *, feasible: BoolArray) -> str:
         """Return why no probe is made, "" if one is."""
         stop, diameter = self.settings.stop, problem.sdf.diameter
         if problem.key.step >= self.settings.probes:
             return "budget"
-        if stop.is_narrow(forecast.spread, diameter, problem.verdict):
+        if stop.is_narrow(forecast.spread, diameter, verdict=problem.verdict):
             return "spread"
         if not feasible.any():
             return "actions"

@@ -86,7 +86,7 @@ def voxel_box(workspace: Workspace, side: float) -> VoxelBox:
     extent = np.minimum(upper - lower, FARTHEST)
     while np.prod(np.ceil(extent / side)) > _MOST_VOXELS:
         side *= 1.25
-    return VoxelBox(lower, side, np.maximum(np.ceil(extent / side), 1.0).astype(np.int64))
+    return VoxelBox(lower, side, counts=np.maximum(np.ceil(extent / side), 1.0).astype(np.int64))
 
 
 def occupancy_entropy(problem: DecisionProblem, box: VoxelBox) -> FloatArray:
@@ -95,7 +95,8 @@ def occupancy_entropy(problem: DecisionProblem, box: VoxelBox) -> FloatArray:
     poses = Poses.of(problem.belief.object_from_world).numbers
     chance = np.zeros(box.counts)
     for pose, weight in zip(poses, problem.belief.weights, strict=True):
-        turn, (x, y, z) = pose[:9].reshape(3, 3, 1), filled - pose[9:, None]
+        turn = pose[:9].reshape(3, 3, 1)
+        (x, y, z) = filled - pose[9:, None]
         places = turn[0] * x + turn[1] * y + turn[2] * z  # (3, N), world
         chance[box.holding(places.T)] += weight
     for known in (problem.points.free, problem.points.known, problem.points.occupied):
@@ -120,7 +121,7 @@ def _widened(front: HandFront, side: float) -> HandFront:
     margin = min(int(0.5 * side / front.cell), _WIDEST)
     heights = np.pad(front.heights, margin, constant_values=-np.inf)
     heights = maximum_filter(heights, 2 * margin + 1, mode="constant", cval=-np.inf)
-    return HandFront(heights, front.lower - margin * front.cell, front.cell)
+    return HandFront(heights, front.lower - margin * front.cell, cell=front.cell)
 
 
 def _reach(travel: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -18,7 +18,9 @@ MODE_DISTANCE = 0.01  # metres between surfaces of different modes, at least
 _BASIN_ANGLE = 0.35  # radians between poses of different basins of one mode, at least
 
 
-def basin_bests(sdf: SdfGrid, poses: Poses, most: int, distance: float = MODE_DISTANCE) -> IntArray:
+def basin_bests(
+    sdf: SdfGrid, poses: Poses, *, most: int, distance: float = MODE_DISTANCE
+) -> IntArray:
     """Return indices of the first pose of each basin, in their order, at most `most`.
 
     Each is farther than a distance (metres) from all chosen before it, or turned against them.
@@ -39,7 +41,7 @@ def basin_bests(sdf: SdfGrid, poses: Poses, most: int, distance: float = MODE_DI
     return np.array(chosen, dtype=np.int64)
 
 
-def has_new_mode(sdf: SdfGrid, old: Poses, new: Poses, count: int) -> bool:
+def has_new_mode(sdf: SdfGrid, old: Poses, *, new: Poses, count: int) -> bool:
     """Return whether a new pose is in a mode of its own.
 
     It is if it is farther from all old poses than `count` old ones, spread as far as possible, are

@@ -54,27 +54,27 @@ class OnlineSettings(CheckedSettings):
 
 
 def first_initial_set(
-    workspace: Workspace, points: KnownPoints, key: StreamKey, settings: OnlineSettings
+    workspace: Workspace, points: KnownPoints, *, key: StreamKey, settings: OnlineSettings
 ) -> FloatArray:
     """Return E_0 before any registration: object_from_world (B, 4, 4)."""
     stream = key.stream(Purpose.INITIAL_POSES)
     count = settings.hypotheses
-    position = uniforms(stream, workspace.lower, workspace.upper, (count, 3))
+    position = uniforms(stream, workspace.lower, upper=workspace.upper, shape=(count, 3))
     if settings.initial == "so3":
         rotation = random_rotations(stream, count)
     else:
-        yaw = uniforms(stream, 0.0, 2.0 * np.pi, count)
+        yaw = uniforms(stream, 0.0, upper=2.0 * np.pi, shape=count)
         rotation = axis_angle(np.broadcast_to([0.0, 0.0, 1.0], (count, 3)), yaw)
     if settings.initial == "origin":
         position = np.zeros((count, 3))
     elif settings.initial == "contact_centroid" and len(points.contacts):
-        spread = uniforms(stream, -_CENTROID_SPREAD, _CENTROID_SPREAD, (count, 3))
+        spread = uniforms(stream, -_CENTROID_SPREAD, upper=_CENTROID_SPREAD, shape=(count, 3))
         position = points.contacts.mean(axis=0) + spread
     return inverse(compose(rotation, position))
 
 
 def updated_initial_set(
-    previous: Hypotheses, key: StreamKey, settings: OnlineSettings
+    previous: Hypotheses, key: StreamKey, *, settings: OnlineSettings
 ) -> FloatArray:
     """Return E_0 around the best previous hypothesis: object_from_world (B, 4, 4).
 
@@ -123,11 +123,11 @@ def posed_problem(
     settings = replace(settings, hypotheses=enlargement * settings.hypotheses)
     low_cost_set = np.zeros((0, 4, 4))
     if previous is None:
-        initial_set = first_initial_set(workspace, points, key, settings)
+        initial_set = first_initial_set(workspace, points, key=key, settings=settings)
     else:
         initial_set = previous.object_from_world[: settings.hypotheses]
         if settings.update == "noise":
-            initial_set = updated_initial_set(previous, key, settings)
+            initial_set = updated_initial_set(previous, key, settings=settings)
         if settings.low_cost_set == "elites":
             low_cost_set = previous.elites
         elif settings.low_cost_set == "estimates":

@@ -34,7 +34,7 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
     import trimesh
 
     path = Path(path).expanduser()
-    refuse_special_file(f"mesh file {path}", path, MeshError)
+    refuse_special_file(f"mesh file {path}", path, error=MeshError)
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "does not exist"
         raise MeshError(f"mesh file {path} {what}; {_ACCEPTED}")
@@ -119,8 +119,8 @@ def clean_mesh(
     import trimesh
 
     require_positive("mesh scale", scale)
-    vertices = frozen(f"{name}: vertices", vertices, (None, 3), error=MeshError)
-    faces = frozen(f"{name}: faces", faces, (None, 3), dtype=np.int64, error=MeshError)
+    vertices = frozen(f"{name}: vertices", vertices, shape=(None, 3), error=MeshError)
+    faces = frozen(f"{name}: faces", faces, shape=(None, 3), dtype=np.int64, error=MeshError)
     if len(faces) == 0:
         raise MeshError(f"{name} has no faces; accepted: triangle meshes")
     outside = ((faces < 0) | (faces >= len(vertices))).any(axis=1)
@@ -131,7 +131,7 @@ def clean_mesh(
             f"accepted: indices of its {len(vertices)} vertices"
         )
     scale *= metres
-    _check_size(name, np.ptp(vertices[np.unique(faces)], axis=0) * scale, hint)
+    _check_size(name, np.ptp(vertices[np.unique(faces)], axis=0) * scale, hint=hint)
 
     # Without textures and normals, whose seams would keep vertices apart.
     mesh = trimesh.Trimesh(vertices * scale, faces, process=False)
@@ -200,7 +200,7 @@ def check_frame(mesh: trimesh.Trimesh, name: str) -> list[MeshWarning]:
     return [MeshWarning("far_frame", text)]
 
 
-def _check_size(name: str, extents: np.ndarray, hint: str) -> None:
+def _check_size(name: str, extents: np.ndarray, *, hint: str) -> None:
     """Raise MeshError unless extents (3,), in metres, are those of a solid of plausible size."""
     largest = float(extents.max())
     size = " x ".join(f"{extent:.4g}" for extent in extents) + " m"

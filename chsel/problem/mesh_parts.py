@@ -39,7 +39,7 @@ def outer_surface(mesh: trimesh.Trimesh, name: str) -> tuple[trimesh.Trimesh, li
         if mesh.volume < 0.0:
             mesh.invert()
         return mesh, []
-    parts = _Parts(mesh, labels, name)
+    parts = _Parts(mesh, labels, name=name)
     parts.turn_outward()
     return parts.united(), parts.warnings
 
@@ -47,7 +47,7 @@ def outer_surface(mesh: trimesh.Trimesh, name: str) -> tuple[trimesh.Trimesh, li
 class _Parts:
     """The parts of a mesh without edges of more than two faces, which are turned and united."""
 
-    def __init__(self, mesh: trimesh.Trimesh, labels: IntArray, name: str) -> None:
+    def __init__(self, mesh: trimesh.Trimesh, labels: IntArray, *, name: str) -> None:
         """labels (F,): the part of each face."""
         self._mesh = mesh
         self._name = name
@@ -184,7 +184,8 @@ class _Parts:
         if not (self._depths[outer][self._faces[self._rows[inner]]] < -_TOUCHING).all():
             return False
         vertices = self._vertices[self._faces[self._rows[outer]].reshape(-1)]
-        lower, upper = self._lower[inner] - _TOUCHING, self._upper[inner] + _TOUCHING
+        lower = self._lower[inner] - _TOUCHING
+        upper = self._upper[inner] + _TOUCHING
         near = vertices[((vertices >= lower) & (vertices <= upper)).all(axis=1)]
         return len(near) == 0 or bool(
             (_winding_distance(self._outward(inner), near) > _TOUCHING).all()
@@ -286,7 +287,8 @@ def _without_hidden(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     import igl
 
     in_front = np.asarray(mesh.triangles_center) + _IN_FRONT * np.asarray(mesh.face_normals)
-    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64)
+    vertices = np.array(mesh.vertices)
+    faces = np.array(mesh.faces, dtype=np.int64)
     inside = igl.fast_winding_number(vertices, faces, in_front) > 0.5
     if inside.any() and not inside.all():
         mesh.update_faces(~inside)
@@ -335,7 +337,7 @@ def _split_edges(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     sheets = DisjointSet(range(int(labels.max()) + 1))
     for rows in by_edge:
         if len(rows) > 2:
-            links += _pairs_of(mesh, rows, labels, sheets)
+            links += _pairs_of(mesh, rows, labels=labels, sheets=sheets)
     first, second = np.array(links).T
     after = np.where(np.arange(len(edges)) % 3 == 2, -2, 1) + np.arange(len(edges))
     reverse = edges[first, 0] != edges[second, 0]
@@ -350,7 +352,7 @@ def _split_edges(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _pairs_of(
-    mesh: trimesh.Trimesh, rows: IntArray, labels: IntArray, sheets: Any
+    mesh: trimesh.Trimesh, rows: IntArray, *, labels: IntArray, sheets: Any
 ) -> list[tuple[int, int]]:
     """Return pairs of the faces around an edge, which belong to the same part.
 
@@ -365,7 +367,8 @@ def _pairs_of(
     angle = np.arctan2(away @ np.cross(axis, away[0]), away @ away[0])
     forward = mesh.edges[rows, 0] < mesh.edges[rows, 1]
     label = labels[rows // 3]
-    left, pairs = set(range(len(rows))), []
+    left = set(range(len(rows)))
+    pairs = []
     while len(left) > 1:
         ranked = []
         for i in sorted(left):

@@ -59,9 +59,11 @@ def estimate_noise(distances: FloatArray, sensor_noise: float) -> Noise:
     sizes = np.sort(np.abs(np.asarray(distances, dtype=np.float64)))
     count = len(sizes)
     middle = 0.5 * (sizes[(count - 1) // 2] + sizes[count // 2]) if count else 0.0
-    sigma, within = max(sensor_noise, _MEDIAN * float(middle)), -1
+    sigma = max(sensor_noise, _MEDIAN * float(middle))
+    within = -1
     for _ in range(_ROUNDS):
-        before, within = within, int(np.searchsorted(sizes, FOREIGN * sigma, side="right"))
+        before = within
+        within = int(np.searchsorted(sizes, FOREIGN * sigma, side="right"))
         if within == before:
             break
         squares = math.fsum((sizes[:within] ** 2).tolist())
@@ -91,7 +93,8 @@ class NoiseModel:
 
     def energies(self, residuals: FloatArray, depths: FloatArray) -> FloatArray:
         """Return E (B,) of poses by residuals (B, N) and depths (B, M), metres."""
-        costs, power = self.costs(residuals).sum(axis=1), self.power(residuals.shape[1])
+        costs = self.costs(residuals).sum(axis=1)
+        power = self.power(residuals.shape[1])
         levels = power * costs - logs(np.array(self.weights))  # (B, K)
         least = levels.min(axis=1)
         known = least - logs(exps(least[:, None] - levels).sum(axis=1))

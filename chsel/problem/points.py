@@ -74,9 +74,9 @@ class KnownPoints(ShapesShown):
 
     def __post_init__(self) -> None:
         for name in POINT_CLASSES:
-            object.__setattr__(self, name, frozen(name, getattr(self, name), (None, 3)))
+            object.__setattr__(self, name, frozen(name, getattr(self, name), shape=(None, 3)))
         sdf = np.zeros(len(self.known)) if self.known_sdf is None else self.known_sdf
-        object.__setattr__(self, "known_sdf", frozen("known_sdf", sdf, (None,)))
+        object.__setattr__(self, "known_sdf", frozen("known_sdf", sdf, shape=(None,)))
         if len(self.sdf) != len(self.known):
             raise PointsError(
                 f"known_sdf has {len(self.sdf)} entries; accepted: one per known point, "
@@ -131,7 +131,7 @@ class Workspace:
     def __post_init__(self) -> None:
         if np.size(self.upper) == 0:
             raise PointsError("workspace has one corner; accepted: chsel.Workspace(lower, upper)")
-        lower, upper = frozen("workspace", (self.lower, self.upper), (2, 3))
+        lower, upper = frozen("workspace", (self.lower, self.upper), shape=(2, 3))
         if not (upper > lower).all():
             raise PointsError(
                 f"workspace runs from {lower.tolist()} to {upper.tolist()}; accepted: every lower "
@@ -148,7 +148,8 @@ class Workspace:
     @classmethod
     def around(cls, points: FloatArray, margin: float) -> Workspace:
         """Return the bounds of points (N, 3), N > 0, padded by `margin` on every side."""
-        lower, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
+        lower = points.min(axis=0) - margin
+        upper = points.max(axis=0) + margin
         return cls(tuple(lower.tolist()), tuple(upper.tolist()))
 
 
@@ -158,7 +159,7 @@ def world_points(name: str, given: Any) -> FloatArray:
     Raises PointsError unless it is such an array, and for places beyond FARTHEST_PLACE.
     """
     given = _no_points() if given is None else given
-    return frozen(name, given, (None, 3), most=FARTHEST_PLACE)
+    return frozen(name, given, shape=(None, 3), most=FARTHEST_PLACE)
 
 
 def world_known_points(
@@ -170,7 +171,7 @@ def world_known_points(
         free=world_points("free", free),
         occupied=world_points("occupied", occupied),
         known=world_points("known", known),
-        known_sdf=frozen("known_sdf", sdf, (None,), most=FARTHEST_PLACE),
+        known_sdf=frozen("known_sdf", sdf, shape=(None,), most=FARTHEST_PLACE),
     )
 
 
@@ -180,7 +181,7 @@ def workspace_around(points: KnownPoints, sdf: SdfGrid) -> Workspace:
 
 
 def check_places(
-    name: str, places: FloatArray, diameter: float, workspace: Workspace | None = None
+    name: str, places: FloatArray, *, diameter: float, workspace: Workspace | None = None
 ) -> list[PointsWarning]:
     """Return a warning if places (N, 3) are so far away that they may be in millimetres.
 
@@ -205,7 +206,7 @@ def check_workspace(workspace: Workspace, diameter: float) -> list[PointsWarning
 
     Raises PointsError for corners beyond FARTHEST_PLACE.
     """
-    frozen("workspace", workspace.bounds, (2, 3), most=FARTHEST_PLACE)
+    frozen("workspace", workspace.bounds, shape=(2, 3), most=FARTHEST_PLACE)
     widest = float(np.ptp(workspace.bounds, axis=0).max())
     if widest <= max(MOST_AWAY * diameter, _LEAST_AWAY):
         return []
@@ -219,7 +220,7 @@ def same_place(diameter: float) -> float:
 
 
 def distinct_points(
-    new: KnownPoints, earlier: KnownPoints, apart: float
+    new: KnownPoints, earlier: KnownPoints, *, apart: float
 ) -> tuple[KnownPoints, list[PointsWarning]]:
     """Return new points at places that were not measured before, and a warning about others.
 
@@ -228,8 +229,8 @@ def distinct_points(
     all kept. A few such points, as in a dense scan, are no warning.
     """
     known, before = (np.column_stack([each.known, each.sdf]) for each in (new, earlier))
-    fresh = first_at_place(known, before, apart)
-    inside = first_at_place(new.occupied, earlier.occupied, apart)
+    fresh = first_at_place(known, before, apart=apart)
+    inside = first_at_place(new.occupied, earlier.occupied, apart=apart)
     repeated = int((~fresh).sum() + (~inside).sum())
     count = len(fresh) + len(inside)
     if repeated == 0:
@@ -249,7 +250,7 @@ def distinct_points(
     return kept, [PointsWarning("repeated", text)]
 
 
-def away_from(points: FloatArray, earlier: FloatArray, apart: float) -> BoolArray:
+def away_from(points: FloatArray, earlier: FloatArray, *, apart: float) -> BoolArray:
     """Return flags (N,) of points (N, k) farther than `apart` from all earlier ones (M, k)."""
     if len(points) == 0 or len(earlier) == 0:
         return np.ones(len(points), dtype=bool)
@@ -261,9 +262,9 @@ def away_from(points: FloatArray, earlier: FloatArray, apart: float) -> BoolArra
     return np.asarray(cKDTree(earlier).query(points)[0] > apart)
 
 
-def first_at_place(points: FloatArray, earlier: FloatArray, apart: float) -> BoolArray:
+def first_at_place(points: FloatArray, earlier: FloatArray, *, apart: float) -> BoolArray:
     """Return flags (N,) of points (N, k) farther than `apart` from earlier (M, k) and kept ones."""
-    first = away_from(points, earlier, apart)
+    first = away_from(points, earlier, apart=apart)
     left = np.flatnonzero(first)
     left = left[np.sort(np.unique(points[left], axis=0, return_index=True)[1])]
     first[:] = False
@@ -300,7 +301,7 @@ class Lattice:
 
     def voxels(self, points: FloatArray) -> np.ndarray:
         """Return indices (N, 3) of the voxels of points (N, 3): nearest centres, ties to even."""
-        return voxels_of(points, np.array(self.origin), self.spacing)
+        return voxels_of(points, np.array(self.origin), side=self.spacing)
 
     def centres(self, voxels: np.ndarray) -> FloatArray:
         """Return centres (N, 3) of voxels (N, 3)."""
@@ -321,7 +322,7 @@ class VoxelGrid:
     flags: BoolArray  # (nx, ny, nz)
 
     @classmethod
-    def around(cls, free: FloatArray, resolution: float, most: int = 100_000_000) -> VoxelGrid:
+    def around(cls, free: FloatArray, resolution: float, *, most: int = 100_000_000) -> VoxelGrid:
         """Return the voxels of free points (N, 3), N > 0. Raises SettingError for too many."""
         bounds = bounds_of(free)
         count = voxels_spanned(bounds, resolution)
@@ -332,8 +333,8 @@ class VoxelGrid:
             )
         lattice = Lattice(tuple(bounds[0].tolist()), resolution)
         flags = np.zeros(lattice.voxels(bounds[1]) + 3, dtype=bool)
-        set_voxels(read_only(free), bounds[0], resolution, flags)
-        return cls(bounds[0] - resolution, resolution, flags)
+        set_voxels(read_only(free), bounds[0], side=resolution, flags=flags)
+        return cls(bounds[0] - resolution, resolution, flags=flags)
 
 
 class FreeVoxels:
@@ -374,12 +375,13 @@ def require_parts(**parts: object) -> None:
     """Raise SettingError unless what is named sdf, points or workspace is of its class."""
     for name, part in parts.items():
         kind, accepted = _PARTS[name]
-        require_instance(name, part, kind, accepted)
+        require_instance(name, part, kind=kind, accepted=accepted)
 
 
 def check_points(
     points: KnownPoints,
     diameter: float,
+    *,
     free_resolution: float,
     workspace: Workspace | None = None,
 ) -> list[PointsWarning]:
@@ -439,7 +441,7 @@ def check_points(
                 f"the farthest {distance.max():.3g} m from it; check workspace, units and frames"
             )
             warnings.append(PointsWarning("contacts_outside", text))
-    if both and (within := _enclosed(contacts, free, free_resolution)).any():
+    if both and (within := _enclosed(contacts, free, resolution=free_resolution)).any():
         text = (
             f"{_count(within, 'contacts')} are in free space: at a free point, or in a free voxel "
             f"of {free_resolution:g} m with free voxels all around; end free space before the "
@@ -460,7 +462,7 @@ def check_contacts(points: KnownPoints) -> list[PointsWarning]:
     return [PointsWarning("no_contact", text)]
 
 
-def _enclosed(contacts: FloatArray, free: FloatArray, resolution: float) -> BoolArray:
+def _enclosed(contacts: FloatArray, free: FloatArray, *, resolution: float) -> BoolArray:
     """Return flags (C,) of contacts at a free point, or in a free voxel with 26 free neighbours.
 
     A contact in a free voxel is common, as the voxel's centre may be outside of the object; between

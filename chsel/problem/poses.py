@@ -89,7 +89,7 @@ def stacked(object_from_world: Any) -> FloatArray:
     return transforms
 
 
-def check_rigid(name: str, transforms: FloatArray, tolerance: float = RIGID_TOLERANCE) -> None:
+def check_rigid(name: str, transforms: FloatArray, *, tolerance: float = RIGID_TOLERANCE) -> None:
     """Raise PoseError unless every (4, 4) of transforms (B, 4, 4) is a rotation and translation."""
     rows = np.ascontiguousarray(transforms[:, :3, :3].transpose(1, 2, 0))  # (3, 3, B)
     products = (rows[[0, 1, 2, 0, 0, 1]] * rows[[0, 1, 2, 1, 2, 2]]).sum(axis=1)  # (6, B)
@@ -111,7 +111,7 @@ def nearest_rigid(name: str, transforms: FloatArray) -> FloatArray:
 
     Raises PoseError unless they are rigid within 1e-3.
     """
-    check_rigid(name, transforms, SENSOR_TOLERANCE)
+    check_rigid(name, transforms, tolerance=SENSOR_TOLERANCE)
     left, _, right = np.linalg.svd(transforms[:, :3, :3])
     return compose(left @ right, transforms[:, :3, 3])
 
@@ -137,11 +137,11 @@ def apply(transforms: FloatArray, points: FloatArray) -> FloatArray:
     return moved + transforms[..., None, :3, 3]
 
 
-def interpolated(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatArray:
+def interpolated(first: FloatArray, second: FloatArray, *, fraction: FloatArray) -> FloatArray:
     """Return transforms (N, 4, 4) at fractions (N,) of the way from first to second (N, 4, 4)."""
     t = np.asarray(fraction, dtype=np.float64)[:, None]
     position = (1.0 - t) * first[:, :3, 3] + t * second[:, :3, 3]
-    turned = slerp(quaternions(first[:, :3, :3]), quaternions(second[:, :3, :3]), fraction)
+    turned = slerp(quaternions(first[:, :3, :3]), quaternions(second[:, :3, :3]), fraction=fraction)
     return compose(rotation_matrices(turned), position)
 
 
@@ -241,7 +241,7 @@ def rotation_matrices(quaternion: FloatArray) -> FloatArray:
     return np.array(rows).transpose(2, 0, 1)
 
 
-def slerp(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatArray:
+def slerp(first: FloatArray, second: FloatArray, *, fraction: FloatArray) -> FloatArray:
     """Return unit quaternions (N, 4) at fractions (N,) of the arcs from first to second (N, 4).
 
     q(t) = (sin((1 - t) a) p + sin(t a) q) / sin a, with the angle a between p and q or -q.

@@ -29,8 +29,10 @@ class Pushes(ShapesShown):
     largest: float  # metres that one push moves the object at most
 
     def __post_init__(self) -> None:
-        directions = frozen("push directions", self.directions, (None, 3))
-        before = frozen("points before pushes", self.before, (len(directions), 3), dtype=np.int64)
+        directions = frozen("push directions", self.directions, shape=(None, 3))
+        before = frozen(
+            "points before pushes", self.before, shape=(len(directions), 3), dtype=np.int64
+        )
         require_positive("largest distance of a push", self.largest)
         if (np.abs((directions**2).sum(axis=1) - 1.0) > _UNIT).any():
             raise PointsError("push directions are not of length 1; accepted: unit vectors (P, 3)")
@@ -60,7 +62,7 @@ class Pushes(ShapesShown):
         """Digest of directions, counts and the largest distance."""
         return digest(self.directions, self.before, np.array([self.largest]))
 
-    def carried(self, points: KnownPoints, distance: float, resolution: float) -> KnownPoints:
+    def carried(self, points: KnownPoints, distance: float, *, resolution: float) -> KnownPoints:
         """Return the points on the object as it is after every push moved it by a distance, metres.
 
         resolution: side of free voxels, metres, each of which keeps the first of its free points:
@@ -71,7 +73,7 @@ class Pushes(ShapesShown):
             for name, count in zip(POINT_CLASSES, counts, strict=True):
                 now[name][:count] += distance * direction
         free = now["free"]
-        x, y, z = voxels_of(free, free[:1], resolution).T
+        x, y, z = voxels_of(free, free[:1], side=resolution).T
         _, first = np.unique((x << 42) + (y << 21) + z, return_index=True)  # within 2^20 voxels
         now["free"] = free[np.sort(first)]
         return replace(points, **now)

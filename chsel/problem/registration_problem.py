@@ -19,7 +19,7 @@ from chsel.problem.sdf_grid import COARSEST, FINEST, SdfGrid
 from chsel.problem.streams import StreamKey
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class RegistrationProblem(ShapesShown):
     """Everything that determines the outcome of one registration, and nothing else."""
 
@@ -37,9 +37,9 @@ class RegistrationProblem(ShapesShown):
     def __post_init__(self) -> None:
         require_parts(sdf=self.sdf, points=self.points, workspace=self.workspace)
         require_positive("free_resolution", self.free_resolution)
-        require_between("free_resolution", self.free_resolution, FINEST, COARSEST)
+        require_between("free_resolution", self.free_resolution, low=FINEST, high=COARSEST)
         for name in ("initial_set", "low_cost_set"):
-            poses = frozen(name, getattr(self, name), (None, 4, 4), error=PoseError)
+            poses = frozen(name, getattr(self, name), shape=(None, 4, 4), error=PoseError)
             check_rigid(name, poses)
             object.__setattr__(self, name, poses)
         if len(self.initial_set) == 0:
@@ -66,7 +66,7 @@ class RegistrationProblem(ShapesShown):
         """
         if self.pushes is None:
             return self
-        points = self.pushes.carried(self.points, distance, self.free_resolution)
+        points = self.pushes.carried(self.points, distance, resolution=self.free_resolution)
         return replace(self, points=points, pushes=None)
 
 
@@ -105,7 +105,7 @@ VERDICTS = ("determined", "several modes", "wide", "nothing fits")
 """What `chsel.problem.trust` says of a result; in recordings 0 to 3, so this order stays."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Trust:
     """A verdict on a result: how well it explains the points, and how far it is unique."""
 
@@ -131,7 +131,8 @@ class Trust:
         """Return one line for people."""
         verdict = self.verdict
         if self.twins is not None:
-            angle, apart = math.degrees(self.twins[0]), 1000.0 * self.twins[1]
+            angle = math.degrees(self.twins[0])
+            apart = 1000.0 * self.twins[1]
             verdict = f"determined up to a turn of {angle:.0f} degrees, {apart:.1f} mm apart"
         return f"{verdict} ({', '.join(self._details)}){self._bound}"
 
@@ -214,8 +215,14 @@ class Hypotheses:
     @cached_property
     def digest(self) -> str:
         """Digest of poses, costs, flags and elites."""
-        parts = (self.object_from_world, self.cost, self.duplicate, self.cell, self.elites)
-        return digest(*parts, *([np.array([self.push_distance])] if self.push_distance else []))
+        return digest(
+            self.object_from_world,
+            self.cost,
+            self.duplicate,
+            self.cell,
+            self.elites,
+            *([np.array([self.push_distance])] if self.push_distance else []),
+        )
 
 
 class Observer(Protocol):
@@ -227,11 +234,11 @@ class Observer(Protocol):
     # Quality-diversity iterations between archive snapshots; 0: only the first and the last.
     snapshot_interval: int
 
-    def progress(self, stage: str, iteration: int, total: int) -> None:
+    def progress(self, stage: str, iteration: int, total: int) -> None:  # noqa: PLR0917
         """Take note that a stage has finished `iteration` of `total` iterations."""
         return
 
-    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:  # noqa: PLR0917
         """Take the state of a stage at its start and after blocks of iterations.
 
         vectors (B, d): of the search; in quality-diversity search, of all elites. cost (B,).

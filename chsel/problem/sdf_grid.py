@@ -101,17 +101,19 @@ class SdfGrid(ShapesShown):
     def __post_init__(self) -> None:
         require_positive("SDF resolution", self.resolution)
         _check_resolution(self.resolution)
-        values = frozen("SDF values", self.values, (None, None, None), error=SdfError)
+        values = frozen("SDF values", self.values, shape=(None, None, None), error=SdfError)
         if min(values.shape) < 2:
             raise SdfError(f"SDF values have shape {values.shape}; accepted: at least 2 per axis")
-        gradients = frozen("SDF gradients", self.gradients, (*values.shape, 3), error=SdfError)
+        gradients = frozen(
+            "SDF gradients", self.gradients, shape=(*values.shape, 3), error=SdfError
+        )
         faces = [np.take(values, end, axis=axis) for axis in range(3) for end in (0, -1)]
         if min(float(face.min()) for face in faces) <= 0.0:
             raise SdfError(
                 "the border of the SDF grid touches the object; accepted: a grid padded so that "
                 "every node of its border is outside"
             )
-        origin = frozen("SDF origin", self.origin, (3,), error=SdfError)
+        origin = frozen("SDF origin", self.origin, shape=(3,), error=SdfError)
         if np.abs(origin).max() > FARTHEST:
             raise SdfError(f"SDF origin is {origin.tolist()}; accepted: up to {FARTHEST:g} (m)")
         object.__setattr__(self, "origin", origin)
@@ -146,7 +148,7 @@ class SdfGrid(ShapesShown):
             resolution, padding = _default_spacing(mesh, padding)
         require_positive("SDF resolution", resolution)
         _check_resolution(resolution)
-        shape = _shape(mesh, resolution, padding)
+        shape = _shape(mesh, resolution, padding=padding)
         if math.prod(shape) > MAX_NODES:
             raise SdfError(
                 f"an SDF of resolution {resolution:g} m needs {math.prod(shape):.3g} nodes; "
@@ -154,7 +156,8 @@ class SdfGrid(ShapesShown):
             )
         _warn_of_thin_walls(mesh, resolution)
         origin = np.asarray(mesh.bounds, dtype=np.float64)[0] - padding
-        values, gradients = np.empty(math.prod(shape)), np.empty((math.prod(shape), 3))
+        values = np.empty(math.prod(shape))
+        gradients = np.empty((math.prod(shape), 3))
         overlaps = 0
         size = max(_PART_NODES, len(mesh.faces) // _PART_FACES)  # prepares the mesh for each part
         for first in range(0, len(values), size):
@@ -171,7 +174,9 @@ class SdfGrid(ShapesShown):
                 "inside twice, where the distance is that to the nearest face, also to those inside"
             )
             warnings.warn(MeshWarning("self_overlap", text), stacklevel=2)
-        return cls(origin, resolution, values.reshape(shape), gradients.reshape(*shape, 3))
+        return cls(
+            origin, resolution, values=values.reshape(shape), gradients=gradients.reshape(*shape, 3)
+        )
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -258,8 +263,8 @@ class SdfGrid(ShapesShown):
         distance to the surface point closest to the grid's nearest point, an upper bound;
         "bounding_box" returns the distance to the grid's box.
         """
-        require_choice("lookup", lookup, LOOKUPS)
-        require_choice("outside", outside, OUTSIDE)
+        require_choice("lookup", lookup, accepted=LOOKUPS)
+        require_choice("outside", outside, accepted=OUTSIDE)
         points = np.asarray(points, dtype=np.float64)
         first, last = self.bounds
         clamped = np.fmin(np.fmax(points, first), last)
@@ -268,13 +273,15 @@ class SdfGrid(ShapesShown):
             rows = self._rows(np.rint(cell))
         else:
             base = self.lowest_nodes(cell)
-            fraction, rows = cell - base, np.zeros((len(cell), 4))
+            fraction = cell - base
+            rows = np.zeros((len(cell), 4))
             sides = (1.0 - fraction, fraction)
             for corner in np.ndindex(2, 2, 2):
                 i, j, k = corner
                 weight = sides[i][:, 0] * sides[j][:, 1] * sides[k][:, 2]
                 rows = rows + weight[:, None] * self._rows(base + np.array(corner))
-        value, gradient = rows[:, 0].copy(), rows[:, 1:].copy()
+        value = rows[:, 0].copy()
+        gradient = rows[:, 1:].copy()
         beyond = (clamped != points).any(axis=1)
         if beyond.any():
             away = points[beyond] - clamped[beyond]
@@ -314,7 +321,7 @@ def _default_spacing(mesh: trimesh.Trimesh, padding: float) -> tuple[float, floa
     if mesh.is_watertight:  # the mean one, also of a plate that is not along the axes
         thickness = min(thickness, 2.0 * abs(float(mesh.volume)) / float(mesh.area))
     coarsest = thickness / _NODES_ACROSS
-    while math.prod(_shape(mesh, spacing, padding)) > DEFAULT_NODES:
+    while math.prod(_shape(mesh, spacing, padding=padding)) > DEFAULT_NODES:
         if spacing < coarsest:
             spacing = min(1.01 * spacing, coarsest)
         elif padding > _LEAST_PADDING * spacing:
@@ -340,7 +347,8 @@ def _warn_of_thin_walls(mesh: trimesh.Trimesh, resolution: float) -> None:
     thin = np.isfinite(walls)
     if thin.mean() < _WALL_SHARE:
         return
-    share, typical = f"{thin.mean():.0%}", f"{1e3 * np.median(walls[thin]):.3g} mm"
+    share = f"{thin.mean():.0%}"
+    typical = f"{1e3 * np.median(walls[thin]):.3g} mm"
     text = (
         f"{share} of the object's surface is on walls of {typical} (median), in which the SDF grid "
         f"has less than {_NODES_ACROSS} nodes: they are {1e3 * resolution:.3g} mm apart, and poses "
@@ -373,7 +381,7 @@ def wall_thicknesses(mesh: trimesh.Trimesh, below: float) -> FloatArray:
     return np.where(thicknesses < below - step, thicknesses, np.inf)
 
 
-def _shape(mesh: trimesh.Trimesh, resolution: float, padding: float) -> tuple[int, ...]:
+def _shape(mesh: trimesh.Trimesh, resolution: float, *, padding: float) -> tuple[int, ...]:
     """Return nodes per axis of the grid of a mesh."""
     lower, upper = np.asarray(mesh.bounds, dtype=np.float64)
     span = upper + padding - (lower - padding)

@@ -22,18 +22,20 @@ class DistanceField(NamedTuple):
     box_distance: bool  # how distances continue outside of the grid, see SdfGrid.at
 
 
-def distance_field(sdf: SdfGrid, lookup: str, outside: str) -> DistanceField:
+def distance_field(sdf: SdfGrid, lookup: str, *, outside: str) -> DistanceField:
     """Return the signed distance field that kernels read; lookup, outside: see SdfGrid.at."""
     trilinear = lookup == "trilinear"
-    box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=trilinear)
-    return DistanceField(box, sdf.table.reshape(-1), trilinear, outside == "bounding_box")
+    box = box_of(sdf.origin, sdf.resolution, shape=sdf.shape, between=trilinear)
+    return DistanceField(
+        box, sdf.table.reshape(-1), trilinear=trilinear, box_distance=outside == "bounding_box"
+    )
 
 
-def cells_below(sdf: SdfGrid, level: float, lookup: str) -> CellSet:
+def cells_below(sdf: SdfGrid, level: float, *, lookup: str) -> CellSet:
     """Return the cells of a grid that read any value below `level`, derived once."""
 
     def make() -> CellSet:
-        box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=lookup == "trilinear")
+        box = box_of(sdf.origin, sdf.resolution, shape=sdf.shape, between=lookup == "trilinear")
         return cell_set_of(box, sdf.active_cells(level, lookup))
 
     return sdf.derived(("cells below", level, lookup), make)
@@ -62,7 +64,11 @@ def distance_between_nodes(box, table, base, u, v, w):
     """Return distance and gradient in the cell of lowest node `base`, at fractions u, v, w."""
     # Unsigned, as an index that may be negative costs more instructions than the sum.
     across, along = np.uint64(np.int64(box.across)), np.uint64(np.int64(box.along))
-    lowest, s, nx, ny, nz = np.uint64(base), 0.0, 0.0, 0.0, 0.0
+    lowest = np.uint64(base)
+    s = 0.0
+    nx = 0.0
+    ny = 0.0
+    nz = 0.0
     for corner in range(8):
         a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
         weight = (u if a else 1.0 - u) * (v if b else 1.0 - v) * (w if c else 1.0 - w)
@@ -134,7 +140,10 @@ def cell_of(box, a, b, c):
 
     The arguments are those of the nearest point of the box then.
     """
-    first, last, most, inverse = box.first, box.last, box.most, box.inverse
+    first = box.first
+    last = box.last
+    most = box.most
+    inverse = box.inverse
     d = min(max(first[0], a), last[0])
     e = min(max(first[1], b), last[1])
     f = min(max(first[2], c), last[2])

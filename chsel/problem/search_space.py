@@ -30,7 +30,7 @@ class SearchSpace(ABC):
     def poses(self, vectors: FloatArray) -> Poses:
         """Return the poses of vectors (B, d)."""
         numbers = np.empty((len(vectors), 12))
-        decode_all(self.arrays, np.array(vectors, dtype=np.float64), numbers)
+        decode_all(self.arrays, np.array(vectors, dtype=np.float64), poses=numbers)
         return Poses(numbers)
 
 
@@ -60,7 +60,7 @@ class PlaneSettings:
     offset: float | None = None  # o = axis . t of object_from_world, metres
 
     def __post_init__(self) -> None:
-        axis = frozen("plane.axis", self.axis, (3,), error=SettingError)
+        axis = frozen("plane.axis", self.axis, shape=(3,), error=SettingError)
         if not (axis**2).sum() > 1e-12:
             raise SettingError(f"axis is {self.axis}; accepted: a vector that is not zero")
         if (self.plane_height is None) == (self.offset is None):
@@ -83,7 +83,9 @@ class SE2Space(SearchSpace):
         if offset is None:
             assert settings.plane_height is not None
             offset = _lowest_point(sdf, axis) - settings.plane_height
-        self.axis, self.e_u, self.e_v = axis, e_u, np.cross(axis, e_u)
+        self.axis = axis
+        self.e_u = e_u
+        self.e_v = np.cross(axis, e_u)
         self.offset = offset
         self.resting_rotation = rotation_vector(np.array(settings.resting_rotation))
         hat_squared = np.outer(axis, axis) - np.eye(3)
@@ -119,7 +121,7 @@ def search_space(plane: PlaneSettings | None, sdf: SdfGrid) -> SearchSpace:
 
 
 def origin_bounds(
-    workspace: Workspace, space: SearchSpace, margin: float
+    workspace: Workspace, space: SearchSpace, *, margin: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return bounds (3,) of the object's origin: the workspace plus a margin in metres.
 

@@ -74,7 +74,7 @@ class CheckedSettings:
 
 
 def build_settings(
-    cls: type[Settings], mapping: Mapping[str, Any], where: str, base: Settings | None = None
+    cls: type[Settings], mapping: Mapping[str, Any], *, where: str, base: Settings | None = None
 ) -> Settings:
     """Make the dataclass `cls` from a plain mapping; nested mappings make nested dataclasses.
 
@@ -99,7 +99,9 @@ def build_settings(
                 f"{where}.{name} does not exist; {meant}accepted: {', '.join(sorted(values))}"
             )
     for name, value in mapping.items():
-        values[name] = _convert(_hints(cls)[name], value, f"{where}.{name}", values[name])
+        values[name] = _convert(
+            _hints(cls)[name], value, where=f"{where}.{name}", before=values[name]
+        )
     missing = [name for name, value in values.items() if value is MISSING]
     if missing:
         raise SettingError(f"{where} lacks {', '.join(missing)}")
@@ -109,12 +111,12 @@ def build_settings(
         raise SettingError(f"{where}: {error}") from None
 
 
-def changed_settings(settings: Settings, changes: Mapping[str, Any], where: str) -> Settings:
+def changed_settings(settings: Settings, changes: Mapping[str, Any], *, where: str) -> Settings:
     """Return `settings` with changes laid over them, group by group; nothing else changes.
 
     Raises SettingError as `build_settings` does.
     """
-    return build_settings(type(settings), changes, where, settings)
+    return build_settings(type(settings), changes, where=where, base=settings)
 
 
 def settings_mapping(settings: Any) -> dict[str, Any]:
@@ -122,7 +124,7 @@ def settings_mapping(settings: Any) -> dict[str, Any]:
     return dataclasses.asdict(settings)
 
 
-def _convert(hint: Any, value: Any, where: str, before: Any = None) -> Any:
+def _convert(hint: Any, value: Any, *, where: str, before: Any = None) -> Any:
     """Return `value` as the annotated type `hint`, or SettingError; groups lie over `before`."""
     if typing.get_origin(hint) is Annotated:
         hint = hint.__origin__
@@ -131,12 +133,12 @@ def _convert(hint: Any, value: Any, where: str, before: Any = None) -> Any:
         if value is None and type(None) in arguments:
             return None
         inner = [argument for argument in arguments if argument is not type(None)]
-        return _convert(inner[0], value, where, before)
+        return _convert(inner[0], value, where=where, before=before)
     if dataclasses.is_dataclass(hint):
         base = before if isinstance(before, hint) else None  # type: ignore[arg-type]
-        return build_settings(typing.cast(type, hint), value, where, base)
+        return build_settings(typing.cast(type, hint), value, where=where, base=base)
     if origin is tuple:
-        return _convert_tuple(arguments, value, where)
+        return _convert_tuple(arguments, value, where=where)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if hint is Any or (isinstance(value, hint) and not (hint is int and isinstance(value, bool))):
@@ -145,7 +147,7 @@ def _convert(hint: Any, value: Any, where: str, before: Any = None) -> Any:
     raise SettingError(f"{where} is {quoted(value)}; accepted: {accepted}")
 
 
-def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+def _convert_tuple(arguments: tuple[Any, ...], value: Any, *, where: str) -> tuple[Any, ...]:
     if not isinstance(value, Sequence) or isinstance(value, str):
         raise SettingError(f"{where} is {quoted(value)}; accepted: a list")
     if len(arguments) == 2 and arguments[1] is Ellipsis:
@@ -153,7 +155,9 @@ def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[
     if len(arguments) != len(value):
         raise SettingError(f"{where} has {len(value)} entries; accepted: {len(arguments)}")
     pairs = zip(arguments, value, strict=True)
-    return tuple(_convert(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(pairs))
+    return tuple(
+        _convert(hint, item, where=f"{where}[{i}]") for i, (hint, item) in enumerate(pairs)
+    )
 
 
 def in_preset(settings: Settings, preset: str) -> Settings:
@@ -162,14 +166,14 @@ def in_preset(settings: Settings, preset: str) -> Settings:
     Each group of settings changes as its own class says, then what `presets` of this class names.
     A class without `presets` is the same in all of them, with its groups.
     """
-    require_choice("preset", preset, PRESETS)
+    require_choice("preset", preset, accepted=PRESETS)
     presets = getattr(settings, "presets", None)
     if presets is None:
         return settings
     values = vars(settings).items()
     groups = {n: in_preset(v, preset) for n, v in values if dataclasses.is_dataclass(v)}
     settings = dataclasses.replace(settings, **groups)  # type: ignore[type-var]
-    return changed_settings(settings, presets.get(preset, {}), f"preset {preset}")
+    return changed_settings(settings, presets.get(preset, {}), where=f"preset {preset}")
 
 
 @dataclass(eq=False)
@@ -193,7 +197,7 @@ class NamedChoices(Generic[Made]):
         Raises SettingError for a name that does not exist, and for a choice of an installed package
         that cannot be imported, is not of this kind, or has two packages.
         """
-        require_choice(self.kind, name, self.names)
+        require_choice(self.kind, name, accepted=self.names)
         if name not in self._entries:
             self._entries[name] = self._load(name)
         return self._entries[name]
@@ -201,7 +205,7 @@ class NamedChoices(Generic[Made]):
     def settings(self, name: str, preset: str = "default") -> Any:
         """Return the settings of a choice by name in a preset of PRESETS; else SettingError."""
         make, default = self.entry(name)
-        require_choice("preset", preset, PRESETS)
+        require_choice("preset", preset, accepted=PRESETS)
         in_own_preset = getattr(make, "preset", None)
         return in_own_preset(preset) if in_own_preset else in_preset(default, preset)
 
@@ -220,8 +224,10 @@ class NamedChoices(Generic[Made]):
         if settings is None:
             settings = default
         elif isinstance(settings, Mapping):
-            settings = changed_settings(default, settings, self.kind)
-        require_instance("settings", settings, kind, f"a mapping, or a {kind.__name__}")
+            settings = changed_settings(default, settings, where=self.kind)
+        require_instance(
+            "settings", settings, kind=kind, accepted=f"a mapping, or a {kind.__name__}"
+        )
         return self.entry(name)[0](settings)
 
     def _load(self, name: str) -> Entry[Made]:

@@ -80,6 +80,7 @@ class StreamKey:
 def uniforms(
     stream: np.random.Generator,
     lower: ArrayLike,
+    *,
     upper: ArrayLike,
     shape: int | tuple[int, ...],
 ) -> FloatArray:

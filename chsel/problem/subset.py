@@ -27,18 +27,20 @@ def farthest_points(points: FloatArray, most: int, *, chosen_first: int = 0) -> 
     return chosen
 
 
-def farthest_poses(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
+def farthest_poses(sdf: SdfGrid, poses: Poses, *, count: int) -> IntArray:
     """Return indices of at most `count` poses, each the farthest from those before it."""
     return farthest_points(surface_descriptors(sdf, poses), count)
 
 
-def representative_poses(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
+def representative_poses(sdf: SdfGrid, poses: Poses, *, count: int) -> IntArray:
     """Return indices of poses such that every pose is near one of them, the first included.
 
     Fewer than `count` if all others have the same descriptors as chosen ones.
     """
     first = np.zeros(min(1, len(poses)), dtype=np.int64)
-    return facilities(squared_distances(sdf, poses), first, count, np.zeros(len(poses)))
+    return facilities(
+        squared_distances(sdf, poses), first, count=count, prices=np.zeros(len(poses))
+    )
 
 
 def squared_distances(sdf: SdfGrid, poses: Poses) -> FloatArray:
@@ -48,7 +50,7 @@ def squared_distances(sdf: SdfGrid, poses: Poses) -> FloatArray:
     return apart
 
 
-def facilities(costs: FloatArray, first: IntArray, count: int, prices: FloatArray) -> IntArray:
+def facilities(costs: FloatArray, first: IntArray, *, count: int, prices: FloatArray) -> IntArray:
     """Return at most `count` of B facilities for C clients, greedily: those in `first` come first.
 
     costs (C, B), not negative, of serving each client from each facility. Every other one chosen
@@ -69,12 +71,12 @@ def surface_descriptors(sdf: SdfGrid, poses: Poses) -> FloatArray:
     """
 
     def make() -> FloatArray:
-        return surface_points(sdf, _PLACES, StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
+        return surface_points(sdf, _PLACES, stream=StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
 
     surface = sdf.derived("descriptors", make)
     some = poses[np.arange(_PLACES) * len(poses) // _PLACES]
     places = rotated(np.swapaxes(some.rotations, 1, 2), surface - some.translations)
-    return surface_distances(sdf, poses, places)
+    return surface_distances(sdf, poses, points=places)
 
 
 @compiled

@@ -31,7 +31,7 @@ _TRIANGLES = {
 }
 
 
-def surface_points(sdf: SdfGrid, count: int, stream: np.random.Generator) -> FloatArray:
+def surface_points(sdf: SdfGrid, count: int, *, stream: np.random.Generator) -> FloatArray:
     """Return points (count, 3) in the object frame, metres, uniform by area on the surface.
 
     Drawn on the zero level of the grid's values, linear on tetrahedra between nodes, then moved by
@@ -66,7 +66,9 @@ def has_surface(sdf: SdfGrid) -> bool:
 def object_centre(sdf: SdfGrid) -> FloatArray:
     """Return the mean (3,) of points on the surface of a grid, in the object frame."""
     stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
-    return sdf.derived("centre", lambda: surface_points(sdf, _CENTRE_POINTS, stream).mean(axis=0))
+    return sdf.derived(
+        "centre", lambda: surface_points(sdf, _CENTRE_POINTS, stream=stream).mean(axis=0)
+    )
 
 
 def _refined(sdf: SdfGrid, points: FloatArray) -> FloatArray:
@@ -77,7 +79,8 @@ def _refined(sdf: SdfGrid, points: FloatArray) -> FloatArray:
     """
     cell = (points - sdf.origin) / sdf.resolution
     base = sdf.lowest_nodes(cell).astype(np.int64)
-    signed, normal = np.zeros(len(points)), np.zeros(points.shape)
+    signed = np.zeros(len(points))
+    normal = np.zeros(points.shape)
     for corner in np.ndindex(2, 2, 2):
         away = cell - (base + corner)
         near = 1.0 - np.abs(away)
@@ -102,12 +105,19 @@ def _zero_level(sdf: SdfGrid) -> FloatArray:
     crossed = np.logical_or.reduce(corners) & ~np.logical_and.reduce(corners)
     nodes = np.argwhere(crossed)[:, None, None] + _TETRAHEDRA  # (cells, 6, 4, 3)
     return np.concatenate(
-        [_triangles(sdf, nodes.reshape(-1, 4, 3), n, edges) for n, edges in _TRIANGLES.items()]
+        [
+            _triangles(sdf, nodes.reshape(-1, 4, 3), inside=n, triangles=edges)
+            for n, edges in _TRIANGLES.items()
+        ]
     )
 
 
 def _triangles(
-    sdf: SdfGrid, nodes: IntArray, inside: int, triangles: tuple[tuple[tuple[int, int], ...], ...]
+    sdf: SdfGrid,
+    nodes: IntArray,
+    *,
+    inside: int,
+    triangles: tuple[tuple[tuple[int, int], ...], ...],
 ) -> FloatArray:
     """Return triangles (T, 3, 3) in the tetrahedra (P, 4, 3) that have `inside` corners inside."""
     values = sdf.values[nodes[..., 0], nodes[..., 1], nodes[..., 2]]
@@ -134,7 +144,9 @@ def outline_distances(sdf: SdfGrid, poses: Poses) -> FloatArray:
     other. As exact as the grid's interpolation, a fraction of its resolution.
     """
     places = outline_in_world(sdf, poses)[:, ::2]  # (B, Q, 3): both surfaces have as many
-    squares = np.array([in_order(signed_distances(sdf, poses, there) ** 2) for there in places])
+    squares = np.array(
+        [in_order(signed_distances(sdf, poses, points=there) ** 2) for there in places]
+    )
     squares /= max(places.shape[1], 1)
     apart: FloatArray = np.sqrt(0.5 * (squares + squares.T))
     np.fill_diagonal(apart, 0.0)
@@ -152,15 +164,15 @@ def surface_spread(distances: FloatArray, weights: FloatArray | None = None) -> 
     return float(np.sqrt(in_order(weights * in_order(weights * distances**2))))
 
 
-def outline_distances_to(sdf: SdfGrid, poses: Poses, other: Poses) -> FloatArray:
+def outline_distances_to(sdf: SdfGrid, poses: Poses, *, other: Poses) -> FloatArray:
     """Return distances (B,), metres, of the object's surface in each pose from that in another.
 
     As in `outline_distances`. other: a single pose.
     """
     there = outline_in_world(sdf, poses)  # (B, Q, 3)
     count, size = there.shape[:2]
-    forth = signed_distances(sdf, other, there.reshape(-1, 3)).reshape(count, size)
-    back = signed_distances(sdf, poses, outline_in_world(sdf, other)[0])  # (B, Q)
+    forth = signed_distances(sdf, other, points=there.reshape(-1, 3)).reshape(count, size)
+    back = signed_distances(sdf, poses, points=outline_in_world(sdf, other)[0])  # (B, Q)
     squares = in_order(forth**2) + in_order(back**2)
     return np.sqrt(squares / (2 * max(size, 1)))
 
@@ -176,9 +188,9 @@ def outline_in_object(sdf: SdfGrid) -> FloatArray:
     return sdf.derived("outline", lambda: _outline(sdf))
 
 
-def signed_distances(sdf: SdfGrid, poses: Poses, points: FloatArray) -> FloatArray:
+def signed_distances(sdf: SdfGrid, poses: Poses, *, points: FloatArray) -> FloatArray:
     """Return signed distances (B, N), metres, of world points (N, 3), at most FARTHEST."""
-    return np.minimum(surface_distances(sdf, poses, points), FARTHEST)
+    return np.minimum(surface_distances(sdf, poses, points=points), FARTHEST)
 
 
 def in_order(values: FloatArray) -> FloatArray:
@@ -191,7 +203,7 @@ def in_order(values: FloatArray) -> FloatArray:
 def _outline(sdf: SdfGrid) -> FloatArray:
     """Return points (Q, 3) on the object's surface, object frame; none without a surface."""
     if has_surface(sdf):
-        return surface_points(sdf, _POINTS, StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
+        return surface_points(sdf, _POINTS, stream=StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
     near = np.argwhere(np.abs(sdf.values) < 2.0 * sdf.resolution)  # of objects thinner than that
     near = near[evenly_spaced(len(near), _POINTS)]
     i, j, k = near.T
@@ -200,17 +212,18 @@ def _outline(sdf: SdfGrid) -> FloatArray:
     return points
 
 
-def surface_distances(sdf: SdfGrid, poses: Poses, points: FloatArray) -> FloatArray:
+def surface_distances(sdf: SdfGrid, poses: Poses, *, points: FloatArray) -> FloatArray:
     """Return signed distances (B, N), metres, of world points (N, 3) to the surface in poses."""
-    field = distance_field(sdf, "trilinear", "surface_point")
-    numbers, places = np.array(poses.numbers), np.array(points)
+    field = distance_field(sdf, "trilinear", outside="surface_point")
+    numbers = np.array(poses.numbers)
+    places = np.array(points)
     distances = np.empty((len(poses), len(points)))
 
     def run(first: int, last: int, _: Any) -> None:
         distances_from_surface(field, numbers, places, distances, first, last)
 
     least = 1 + _LOOKUPS_PER_THREAD // max(len(points), 1)
-    parallel_for(run, len(poses), lambda: None, least=least)
+    parallel_for(run, len(poses), scratch=lambda: None, least=least)
     return distances
 
 

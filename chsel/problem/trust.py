@@ -75,6 +75,7 @@ _MOST_KNOWN, _MOST_FREE = 1000, 5000
 def trust_in(
     problem: RegistrationProblem,
     hypotheses: Hypotheses,
+    *,
     sensor_noise: float = SENSOR_NOISE,
     rivals: Poses | None = None,
 ) -> Trust:
@@ -91,11 +92,11 @@ def trust_in(
     require_positive("sensor_noise", sensor_noise)
     problem = problem.carried(hypotheses.push_distance)
     sdf, points = problem.sdf, problem.points
-    poses, indices = explaining(problem, hypotheses, sensor_noise, rivals)
-    off = signed_distances(sdf, poses[:1], points.known)[0] - points.sdf
+    poses, indices = explaining(problem, hypotheses, sensor_noise=sensor_noise, rivals=rivals)
+    off = signed_distances(sdf, poses[:1], points=points.known)[0] - points.sdf
     noise = estimate_noise(off, sensor_noise)
     most = FOREIGN * noise.sigma
-    error = float(_mean_error(problem, poses[:1], sensor_noise, most))
+    error = float(_mean_error(problem, poses[:1], sensor_noise=sensor_noise, most=most))
     alike = correlation(points.known, np.clip(off, -most, most)) > SYSTEMATIC
     share = MOST_SYSTEMATIC if alike else MOST_OFF
     limit = max(share * sdf.diameter, _GRID_ERROR * sdf.resolution, LEAST_LEVELS * sensor_noise)
@@ -104,7 +105,7 @@ def trust_in(
     width = max(MOST_WIDTH * sdf.diameter, LEAST_LEVELS * sensor_noise)
     gap = max(width, LEAST_GAP * noise.sigma)
     near = apart <= gap
-    count, mode = connected_components(near & ~turned(sdf, poses, near), directed=False)
+    count, mode = connected_components(near & ~turned(sdf, poses, pairs=near), directed=False)
     parts = [np.flatnonzero(mode == one) for one in range(count)]
     redundancy = max(len(off) - FREEDOMS, 0)
     why = ""
@@ -124,7 +125,9 @@ def trust_in(
         verdict = WIDE
     else:
         bests = [poses[part[:1]] for part in parts]
-        cost = min(motion_cost(problem, pose, sensor_noise, width) for pose in bests)
+        cost = min(
+            motion_cost(problem, pose, sensor_noise=sensor_noise, distance=width) for pose in bests
+        )
         if cost <= NEAR_LIMIT * LIMIT:
             least = max(cost, 0.0)
             why = f"moving it {1000.0 * width:.1f} mm costs {least:.1f} nats, wide up to {LIMIT:g}"
@@ -133,7 +136,7 @@ def trust_in(
         count = 0  # groups of such poses are no modes
     firsts = [int(indices[part[0]]) for part in parts[: max(count, 1)]]
     best = tuple(index for index in firsts if index >= 0)
-    twins = _largest_turn(poses, apart, parts) if verdict == SEVERAL and near.all() else None
+    twins = _largest_turn(poses, apart, parts=parts) if verdict == SEVERAL and near.all() else None
     return Trust(
         noise=noise.sigma,
         outliers=noise.outliers,
@@ -152,6 +155,7 @@ def trust_in(
 def explaining(
     problem: RegistrationProblem,
     hypotheses: Hypotheses,
+    *,
     sensor_noise: float,
     rivals: Poses | None = None,
 ) -> tuple[Poses, IntArray]:
@@ -164,7 +168,7 @@ def explaining(
     if rivals is not None:
         poses = Poses.joined([poses, rivals])
         indices = np.concatenate([indices, np.full(len(rivals), -1)])
-    energies = pose_energies(problem, poses, noise_model(sensor_noise))
+    energies = pose_energies(problem, poses, noise=noise_model(sensor_noise))
     allowed = np.full(len(poses), energies.min() + LIMIT)
     if len(problem.points.known) < MANY_CONTACTS:
         allowed[count:] += FOREIGN_CONTACT
@@ -176,6 +180,7 @@ def explaining(
 def fits_elsewhere(
     problem: RegistrationProblem,
     hypotheses: Hypotheses,
+    *,
     other: RegistrationProblem,
     poses: Poses,
     sensor_noise: float,
@@ -184,14 +189,15 @@ def fits_elsewhere(
 
     problem, other: of one object, that pushes have moved by different distances.
     """
-    best, noise = Poses.of(hypotheses.object_from_world[:1]), noise_model(sensor_noise)
-    limit = pose_energies(problem, best, noise)[0] + LIMIT
-    apart = outline_distances_to(problem.sdf, poses, best)
+    best = Poses.of(hypotheses.object_from_world[:1])
+    noise = noise_model(sensor_noise)
+    limit = pose_energies(problem, best, noise=noise)[0] + LIMIT
+    apart = outline_distances_to(problem.sdf, poses, other=best)
     width = max(MOST_WIDTH * problem.sdf.diameter, LEAST_LEVELS * sensor_noise)
-    return bool(((pose_energies(other, poses, noise) <= limit) & (apart > width)).any())
+    return bool(((pose_energies(other, poses, noise=noise) <= limit) & (apart > width)).any())
 
 
-def turned(sdf: SdfGrid, poses: Poses, pairs: BoolArray) -> BoolArray:
+def turned(sdf: SdfGrid, poses: Poses, *, pairs: BoolArray) -> BoolArray:
     """Return flags (B, B) of those pairs of poses that differ by a rotation that is no symmetry.
 
     Such a rotation is larger than TURN, and about the object's middle it moves the surface by more
@@ -202,7 +208,7 @@ def turned(sdf: SdfGrid, poses: Poses, pairs: BoolArray) -> BoolArray:
     turns = product(poses.rotations[one], np.swapaxes(poses.rotations[other], 1, 2))
     outline, centre = outline_in_object(sdf), middle(sdf)
     about = Poses.of(compose(turns, centre - rotated(turns, centre)))
-    squares = in_order(signed_distances(sdf, about, outline) ** 2) / max(len(outline), 1)
+    squares = in_order(signed_distances(sdf, about, points=outline) ** 2) / max(len(outline), 1)
     moved = np.sqrt(squares) > SYMMETRIC * sdf.diameter
     result[one[moved], other[moved]] = True
     return result | result.T
@@ -227,7 +233,7 @@ def _angles(poses: Poses) -> FloatArray:
     return rotation_angle(product(poses.rotations[:, None], np.swapaxes(poses.rotations, 1, 2)))
 
 
-def _largest_turn(poses: Poses, apart: FloatArray, parts: list[IntArray]) -> tuple[float, float]:
+def _largest_turn(poses: Poses, apart: FloatArray, *, parts: list[IntArray]) -> tuple[float, float]:
     """Return the angle (radians) and distance (m) of the two modes that differ most."""
     firsts = [int(part[0]) for part in parts]
     angles = _angles(poses[np.array(firsts)])
@@ -301,7 +307,7 @@ def _compared(hypotheses: Hypotheses) -> tuple[Poses, IntArray]:
 
 
 def _mean_error(
-    problem: RegistrationProblem, pose: Poses, sensor_noise: float, most: float
+    problem: RegistrationProblem, pose: Poses, *, sensor_noise: float, most: float
 ) -> float:
     """Return the mean error of a pose, metres, of known points and others that contradict it.
 
@@ -310,18 +316,18 @@ def _mean_error(
     its depth.
     """
     points, sdf = problem.points, problem.sdf
-    off = np.abs(signed_distances(sdf, pose, points.known)[0] - points.sdf)
+    off = np.abs(signed_distances(sdf, pose, points=points.known)[0] - points.sdf)
     tolerance = problem.free_resolution + LEAST_LEVELS * sensor_noise
     errors = [np.minimum(off, most)]
     for sign, group in ((-1.0, points.free), (1.0, points.occupied)):
-        depths = sign * signed_distances(sdf, pose, group)[0]
+        depths = sign * signed_distances(sdf, pose, points=group)[0]
         errors.append(depths[depths > tolerance])
     every = np.concatenate(errors)
     return float(in_order(every)) / max(len(every), 1)
 
 
 def motion_cost(
-    problem: RegistrationProblem, pose: Poses, sensor_noise: float, distance: float
+    problem: RegistrationProblem, pose: Poses, *, sensor_noise: float, distance: float
 ) -> float:
     """Return the rise of the energy, nats, if the object's surface moves by a distance, metres.
 
@@ -336,9 +342,11 @@ def motion_cost(
     motions = _loosest_motions(problem, pose)
     if len(motions) == 0:
         return math.inf
-    moved = _moved(problem, pose, distance * np.concatenate([motions, -motions]))
-    energies = pose_energies(problem, Poses.joined([pose, moved]), noise_model(sensor_noise))
-    apart = outline_distances_to(problem.sdf, moved, pose)  # near for turns that are symmetries
+    moved = _moved(problem, pose, twists=distance * np.concatenate([motions, -motions]))
+    energies = pose_energies(problem, Poses.joined([pose, moved]), noise=noise_model(sensor_noise))
+    apart = outline_distances_to(
+        problem.sdf, moved, other=pose
+    )  # near for turns that are symmetries
     rises = energies[1:] - energies[0]
     return float(rises[apart >= 0.5 * distance].min(initial=math.inf))
 
@@ -346,11 +354,11 @@ def motion_cost(
 def _loosest_motions(problem: RegistrationProblem, pose: Poses) -> FloatArray:
     """Return twists (K, 6) as `_moved` takes them, K at most 6, by which the surface moves by 1."""
     sdf, step = problem.sdf, 0.5 * problem.sdf.resolution
-    nearby = _moved(problem, pose, step * np.concatenate([np.eye(6), -np.eye(6)]))
+    nearby = _moved(problem, pose, twists=step * np.concatenate([np.eye(6), -np.eye(6)]))
 
     def products(points: FloatArray) -> FloatArray:
         """Return mean products (6, 6) of the rates at which distances of world points change."""
-        distances = signed_distances(sdf, nearby, points)  # (12, N)
+        distances = signed_distances(sdf, nearby, points=points)  # (12, N)
         rates = (distances[:6] - distances[6:]) / (2.0 * step)
         return in_order(rates[:, None] * rates) / max(len(points), 1)
 
@@ -380,7 +388,7 @@ def _orthonormal(vectors: FloatArray, metric: FloatArray) -> FloatArray:
     return np.array(result).reshape(-1, 6)
 
 
-def _moved(problem: RegistrationProblem, pose: Poses, twists: FloatArray) -> Poses:
+def _moved(problem: RegistrationProblem, pose: Poses, *, twists: FloatArray) -> Poses:
     """Return a pose after motions (K, 6) of the object: shifts, and turns about its middle, metres.
 
     Turns are lengths of arc at half a diameter.
@@ -392,18 +400,21 @@ def _moved(problem: RegistrationProblem, pose: Poses, twists: FloatArray) -> Pos
     return Poses.of(compose(turned, rotated(turn, pose.translations) + shift))
 
 
-def pose_energies(problem: RegistrationProblem, poses: Poses, noise: NoiseModel) -> FloatArray:
+def pose_energies(problem: RegistrationProblem, poses: Poses, *, noise: NoiseModel) -> FloatArray:
     """Return minus the log-likelihood (B,) of the points in poses, nats, see `chsel.problem.noise`.
 
     Some of many points represent all; those left out count for nothing.
     """
     points, sdf = problem.points, problem.sdf
     known = evenly_spaced(len(points.known), _MOST_KNOWN)
-    residuals = signed_distances(sdf, poses, points.known[known]) - points.sdf[known]
+    residuals = signed_distances(sdf, poses, points=points.known[known]) - points.sdf[known]
     free, occupied = (
         group[evenly_spaced(len(group), _MOST_FREE)] for group in (points.free, points.occupied)
     )
-    depths = [-signed_distances(sdf, poses, free), signed_distances(sdf, poses, occupied)]
+    depths = [
+        -signed_distances(sdf, poses, points=free),
+        signed_distances(sdf, poses, points=occupied),
+    ]
     return noise.energies(residuals, np.concatenate(depths, axis=1))
 
 

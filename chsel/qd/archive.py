@@ -42,11 +42,11 @@ class Evaluated(NamedTuple):
 
 
 def evaluated(
-    objective: SearchObjective, measure: Measure, vectors: FloatArray, costs: Any = None
+    objective: SearchObjective, measure: Measure, *, vectors: FloatArray, costs: Any = None
 ) -> Evaluated:
     """Return vectors (B, d) with their measures, and their costs (B,) unless known already."""
     costs = objective.costs(vectors) if costs is None else costs
-    return Evaluated(vectors, costs, measure.values(objective.space, vectors))
+    return Evaluated(vectors, costs, measures=measure.values(objective.space, vectors))
 
 
 class Cells(NamedTuple):
@@ -73,7 +73,7 @@ class Batch(NamedTuple):
     order: IntArray  # (B,), filled by `rank`, best first
 
 
-def batch_of(count: int, dimension: int, measures: int) -> Batch:
+def batch_of(count: int, dimension: int, *, measures: int) -> Batch:
     """Return an empty batch of `count` solutions of `dimension` numbers."""
     return Batch(
         vectors=np.zeros((count, dimension)),
@@ -91,7 +91,10 @@ def cell_for(archive: Cells, objective: float, vector: FloatArray, measures: Flo
     """Return the cell of a solution, the nearest one for measures (k,) out of range; -1 if NaN."""
     if not (np.isfinite(objective) and all_finite(measures) and all_finite(vector)):
         return -1
-    lower, upper, bins, cell = archive.lower, archive.upper, archive.bins, 0
+    lower = archive.lower
+    upper = archive.upper
+    bins = archive.bins
+    cell = 0
     for i in range(len(measures)):
         x = measures[i]
         if archive.circular:
@@ -120,8 +123,12 @@ def keep_better(
 @compiled
 def insert(archive: Cells, batch: Batch) -> None:
     """Offer a batch; fills its cells, status and value, see GridArchive.add."""
-    vectors, objectives, measures = batch.vectors, batch.objectives, batch.measures
-    cells, status, value = batch.cells, batch.status, batch.value
+    vectors = batch.vectors
+    objectives = batch.objectives
+    measures = batch.measures
+    cells = batch.cells
+    status = batch.status
+    value = batch.value
     for i in range(len(objectives)):
         cells[i] = cell_for(archive, objectives[i], vectors[i], measures[i])
         old = archive.objectives[cells[i]]
@@ -185,7 +192,7 @@ class GridArchive:
     """
 
     def __init__(
-        self, measure: Measure, lower: FloatArray, upper: FloatArray, *, bins: int, dimension: int
+        self, measure: Measure, lower: FloatArray, *, upper: FloatArray, bins: int, dimension: int
     ) -> None:
         self.measure = measure
         self.shape = (bins,) * measure.count
@@ -201,22 +208,24 @@ class GridArchive:
             measures=np.zeros((cells, measure.count)),
         )
 
-    def add(self, solutions: FloatArray, objectives: FloatArray, measures: FloatArray) -> Batch:
+    def add(self, solutions: FloatArray, objectives: FloatArray, *, measures: FloatArray) -> Batch:
         """Offer solutions (B, d) with objectives (B,) and measures (B, k).
 
         Status and value against the archive before: 2 and the objective for an empty cell, 1 for a
         higher objective and 0 for a lower one, and the gain. A cell keeps the highest, the first of
         equals. A solution of which any number is not finite is refused: cell -1, 0 and -inf.
         """
-        batch = batch_of(len(solutions), self.cells.solutions.shape[1], self.measure.count)
-        batch.vectors[:], batch.objectives[:], batch.measures[:] = solutions, objectives, measures
+        batch = batch_of(len(solutions), self.cells.solutions.shape[1], measures=self.measure.count)
+        batch.vectors[:] = solutions
+        batch.objectives[:] = objectives
+        batch.measures[:] = measures
         insert(self.cells, batch)
         return batch
 
     def update_cells(self, *offered: Evaluated) -> None:
         """Offer one batch of solutions after the other (CHSEL, Alg. 1, line 5)."""
         for batch in offered:
-            self.add(batch.vectors, -batch.costs, batch.measures)
+            self.add(batch.vectors, -batch.costs, measures=batch.measures)
 
     @property
     def occupied(self) -> IntArray:

@@ -107,9 +107,13 @@ def mega_iterations(landscape, archive, search, normals, elites, first, last):
     chooses an elite for a restart.
     """
     model, space, measure, work = landscape
-    theta, measures, gradient = search.theta, search.measures, search.gradient
+    theta = search.theta
+    measures = search.measures
+    gradient = search.gradient
     measure_gradients, directions = search.measure_gradients, search.directions
-    coefficients, branches, strategy = search.coefficients, search.branches, search.strategy
+    coefficients = search.coefficients
+    branches = search.branches
+    strategy = search.strategy
     for iteration in range(first, last):
         objective = -cost_and_gradient_of(model, space, theta, gradient, work)
         measures_of(space, measure, theta, measures)
@@ -211,12 +215,15 @@ def _move_towards(theta, branches, weights, parents, adam):
 def mega_search(
     start: FloatArray,
     measures: int,
+    *,
     batch: int,
     settings: EmitterSettings,
     epsilon: float = EPSILON,
 ) -> MegaSearch:
     """Return CMA-MEGA at theta = start (d,), of so many measures and branches; Adam's epsilon."""
-    d, n, parity = len(start), measures + 1, settings.ribs_parity
+    d = len(start)
+    n = measures + 1
+    parity = settings.ribs_parity
     return MegaSearch(
         theta=np.array(start, dtype=np.float64),
         measures=np.zeros(measures),
@@ -224,22 +231,27 @@ def mega_search(
         measure_gradients=np.zeros((measures, d)),
         directions=np.zeros((n, d)),
         coefficients=np.zeros((batch, n)),
-        branches=batch_of(batch, d, measures),
-        strategy=strategy_around(np.zeros(n), batch, settings.sigma0, ribs_parity=parity),
-        adam=Adam(float(settings.rate), float(epsilon), np.zeros((2, d)), np.ones(2)),
+        branches=batch_of(batch, d, measures=measures),
+        strategy=strategy_around(np.zeros(n), batch, sigma0=settings.sigma0, ribs_parity=parity),
+        adam=Adam(
+            float(settings.rate), float(epsilon), moments=np.zeros((2, d)), powers=np.ones(2)
+        ),
     )
 
 
-def me_search(start: FloatArray, measures: int, batch: int, settings: EmitterSettings) -> MeSearch:
+def me_search(
+    start: FloatArray, measures: int, *, batch: int, settings: EmitterSettings
+) -> MeSearch:
     """Return CMA-ME around start (d,), with so many measures and samples."""
     parity = settings.ribs_parity
-    strategy = strategy_around(start, batch, settings.sigma0, ribs_parity=parity)
-    return MeSearch(batch_of(batch, len(start), measures), strategy)
+    strategy = strategy_around(start, batch, sigma0=settings.sigma0, ribs_parity=parity)
+    return MeSearch(batch_of(batch, len(start), measures=measures), strategy)
 
 
 def fill_archive(
     name: str,
     objective: SearchObjective,
+    *,
     archive: GridArchive,
     start: FloatArray,
     count: int,
@@ -253,14 +265,17 @@ def fill_archive(
     CMA-MEGA: theta, at first `start` (d,), with its gradients, and branches around it. CMA-ME:
     samples of an evolution strategy, whose first mean is `start`. refinement: index of the pass.
     """
-    measures, total = archive.measure.count, settings.iterations
-    search: Any = me_search(start, measures, count, settings)
+    measures = archive.measure.count
+    total = settings.iterations
+    search: Any = me_search(start, measures, batch=count, settings=settings)
     run = me_iterations
     if name == "cma_mega":
-        run, search = mega_iterations, mega_search(start, measures, max(count - 1, 1), settings)
-    batch, dimension = search.strategy.batch, len(search.strategy.mean)
+        run = mega_iterations
+        search = mega_search(start, measures, batch=max(count - 1, 1), settings=settings)
+    batch = search.strategy.batch
+    dimension = len(search.strategy.mean)
     model, space = objective.model, objective.space_arrays
-    landscape = Landscape(model, space, archive.measure.code, objective.work())
+    landscape = Landscape(model, space, measure=archive.measure.code, work=objective.work())
     stream = key.stream(Purpose.EMITTER, refinement)
     elites = key.stream(Purpose.RESTART, refinement).random(total)
     interval = observer.snapshot_interval or total
@@ -268,10 +283,11 @@ def fill_archive(
     observer.snapshot(archive.snapshot(0, refinement))
     for begin in range(0, total, _TRACED):
         end = min(begin + _TRACED, total)
-        random = normals(stream, (end - begin, batch, dimension)), elites[begin:end]
+        draws = normals(stream, (end - begin, batch, dimension))
+        parents = elites[begin:end]
         stops = [n for n in range(begin + 1, end) if n % interval == 0]
         for first, last in pairwise([begin, *stops, end]):
-            run(landscape, archive.cells, search, *random, first - begin, last - begin)
+            run(landscape, archive.cells, search, draws, parents, first - begin, last - begin)
             if last == end:
                 observer.trace(name, last, archive.solutions, archive.costs)
                 observer.progress(name, last, total)

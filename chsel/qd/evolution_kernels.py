@@ -44,10 +44,11 @@ class Strategy(NamedTuple):
 
 
 def strategy_around(
-    mean: FloatArray, batch: int, sigma0: float, *, ribs_parity: bool = False
+    mean: FloatArray, batch: int, *, sigma0: float, ribs_parity: bool = False
 ) -> Strategy:
     """Return a new strategy around `mean` (n,)."""
-    n, ranks = len(mean), np.arange(1.0, batch + 1.0)
+    n = len(mean)
+    ranks = np.arange(1.0, batch + 1.0)
     return Strategy(
         batch=batch,
         sigma0=float(sigma0),
@@ -86,7 +87,9 @@ def reset(strategy: Strategy) -> None:
 @inner
 def ask(strategy: Strategy, normals: FloatArray, samples: FloatArray) -> None:
     """Fill samples (L, n), m + sigma B D z, from standard normal draws z (L, n)."""
-    mean, values, vectors = strategy.mean, strategy.eigenvalues, strategy.eigenvectors
+    mean = strategy.mean
+    values = strategy.eigenvalues
+    vectors = strategy.eigenvectors
     n, evaluations = len(mean), strategy.evaluations[0]
     if evaluations == 0:
         mueff = _weigh(strategy.logarithms, max(strategy.batch // 2, 1), strategy.weights)

@@ -53,7 +53,9 @@ def measure_gradients_of(space: Any, measure: Any, vector: Any, out: Any) -> Non
     r = decode(space, vector)
     none = 0.0
     for i in range(measure.size):
-        first, second, third = _is(i, 0), _is(i, 1), _is(i, 2)
+        first = _is(i, 0)
+        second = _is(i, 1)
+        third = _is(i, 2)
         if measure.kind == TRANSLATION:
             by_rotation = (none, none, none, none, none, none, none, none, none)
             by_translation = first, second, third
@@ -150,7 +152,7 @@ MEASURES = {**_ANY, **_SE3_ONLY, **_SE2_ONLY}
 
 def measure_named(name: str, *, planar: bool) -> Measure:
     """Return the measure of that name; SettingError if it does not exist in this search space."""
-    require_choice("measure", name, MEASURES)
+    require_choice("measure", name, accepted=MEASURES)
     refused, wanted = (_SE3_ONLY, "without plane") if planar else (_SE2_ONLY, "with plane")
     if name in refused:
         fitting = sorted({**_ANY, **(_SE2_ONLY if planar else _SE3_ONLY)})

@@ -48,7 +48,7 @@ class ArchiveSettings(CheckedSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         count = MEASURES[self.measure].count
-        require_at_most(f"bins ** {count}, the number of cells,", self.bins**count, MOST_CELLS)
+        require_at_most(f"bins ** {count}, the number of cells,", self.bins**count, most=MOST_CELLS)
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,7 @@ class OutputSettings(CheckedSettings):
 def sized_archive(
     estimates: Evaluated,
     measure: Measure,
+    *,
     settings: ArchiveSettings,
     known_count: int,
     dimension: int,
@@ -97,15 +98,17 @@ def sized_archive(
 
     Mean and deviations are those of the measures of estimates E' that are no outliers.
     """
-    kept = estimates.measures[_inliers(estimates.costs, settings, known_count)]
+    kept = estimates.measures[_inliers(estimates.costs, settings, known_count=known_count)]
     mean, deviation = measure.moments(kept if len(kept) >= 2 else estimates.measures)
     half = settings.range_sigmas * np.maximum(deviation, settings.least_deviation)
     if measure.circular:
         half = np.minimum(half, np.pi)
-    return GridArchive(measure, mean - half, mean + half, bins=settings.bins, dimension=dimension)
+    return GridArchive(
+        measure, mean - half, upper=mean + half, bins=settings.bins, dimension=dimension
+    )
 
 
-def _inliers(costs: FloatArray, settings: ArchiveSettings, known_count: int) -> BoolArray:
+def _inliers(costs: FloatArray, settings: ArchiveSettings, *, known_count: int) -> BoolArray:
     if settings.outliers == "none":
         return np.ones(len(costs), dtype=bool)
     if settings.outliers == "quantile":
@@ -117,21 +120,23 @@ def _inliers(costs: FloatArray, settings: ArchiveSettings, known_count: int) -> 
 def select_elites(
     costs: FloatArray,
     elites: Poses,
+    *,
     problem: RegistrationProblem,
     space: SearchSpace,
     settings: OutputSettings,
     stream: np.random.Generator,
 ) -> IntArray:
     """Return indices of as many of C elites with costs (C,) as E_0 has, or as set; best first."""
-    count, known_count = len(problem.initial_set), len(problem.points.known)
+    count = len(problem.initial_set)
+    known_count = len(problem.points.known)
     order = np.argsort(costs, kind="stable")
-    order = order[within_workspace(elites, problem, space, settings.margin)[order]]
-    good = order[costs[order] <= _limit(costs[order], settings, known_count)]
+    order = order[within_workspace(elites, problem, space=space, margin=settings.margin)[order]]
+    good = order[costs[order] <= _limit(costs[order], settings, known_count=known_count)]
     if settings.choice == "representative" and len(good) > count and has_surface(problem.sdf):
         poses = elites[good]
         pool = evenly_spaced(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
         most = min(count, _MOST_REPRESENTATIVE)
-        chosen = pool[representative_poses(problem.sdf, poses[pool], most)]
+        chosen = pool[representative_poses(problem.sdf, poses[pool], count=most)]
         others = np.setdiff1d(np.arange(len(poses)), chosen)
         others = others[evenly_spaced(len(others), count - len(chosen))]
         return good[np.sort(np.concatenate([chosen, others]))]
@@ -143,7 +148,7 @@ def select_elites(
 
 
 def within_workspace(
-    poses: Poses, problem: RegistrationProblem, space: SearchSpace, margin: float | None
+    poses: Poses, problem: RegistrationProblem, *, space: SearchSpace, margin: float | None
 ) -> BoolArray:
     """Return True (B,) where the object's origin is in the workspace, widened by a margin (m).
 
@@ -152,12 +157,12 @@ def within_workspace(
     everywhere = np.ones(len(poses), dtype=bool)
     if margin is None:
         return everywhere
-    lower, upper = origin_bounds(problem.workspace, space, margin)
+    lower, upper = origin_bounds(problem.workspace, space, margin=margin)
     inside: BoolArray = np.all((poses.origins >= lower) & (poses.origins <= upper), axis=1)
     return inside if inside.any() else everywhere
 
 
-def _limit(costs: FloatArray, settings: OutputSettings, known_count: int) -> float:
+def _limit(costs: FloatArray, settings: OutputSettings, *, known_count: int) -> float:
     best = float(costs.min())
     if settings.limit == "none":
         return float("inf")
@@ -177,6 +182,7 @@ def repeated(poses: Poses) -> BoolArray:
 def ranked_hypotheses(
     objective: SearchObjective,
     poses: Poses,
+    *,
     cells: IntArray | None = None,
     elites: Poses | None = None,
     archive: ArchiveSnapshot | None = None,
@@ -184,12 +190,13 @@ def ranked_hypotheses(
     """Return poses in order of their costs, which are computed; otherwise as `ranked`."""
     cost = objective.costs(objective.space.encode(poses))
     kept = None if elites is None else elites.matrices
-    return ranked(poses.matrices, cost, cells, kept, archive)
+    return ranked(poses.matrices, cost, cells=cells, elites=kept, archive=archive)
 
 
 def ranked(
     object_from_world: FloatArray,
     cost: FloatArray,
+    *,
     cells: IntArray | None = None,
     elites: FloatArray | None = None,
     archive: ArchiveSnapshot | None = None,
@@ -208,4 +215,11 @@ def ranked(
     poses = object_from_world[order]
     cells = np.full(len(poses), -1, dtype=np.int64) if cells is None else cells[order]
     elites = poses if elites is None else elites
-    return Hypotheses(poses, cost[order], repeated(Poses.of(poses)), cells, elites, archive)
+    return Hypotheses(
+        poses,
+        cost[order],
+        duplicate=repeated(Poses.of(poses)),
+        cell=cells,
+        elites=elites,
+        archive=archive,
+    )

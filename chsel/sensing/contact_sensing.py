@@ -1,5 +1,7 @@
-"""Contacts of pads and hands: where a soft membrane with a camera behind it is pressed in (CHSEL,
-Sec. V-B), and where a solid body is touched, by the force and torque that act on it.
+"""Contacts of pads and of hands.
+
+A soft membrane with a camera behind it touches where it is pressed in (CHSEL, Sec. V-B), a solid
+body where the force and torque that act on it say.
 
 A contact at p exerts the force f and, about the origin, the torque t = p x f: so p is on the line
 of points f x t / |f|^2 + s f, the axis of the wrench (Bicchi, Salisbury and Brock, "Contact sensing
@@ -68,7 +70,7 @@ def contact_mask(
     return counted & (deformation > level)
 
 
-def contact_subset(count: int, most: int, stream: np.random.Generator) -> IntArray:
+def contact_subset(count: int, most: int, *, stream: np.random.Generator) -> IntArray:
     """Return ascending indices of at most `most` of `count` pixels; all subsets are equally likely.
 
     All of them, without drawing from the stream, if there are no more than that.
@@ -102,7 +104,9 @@ class ForceContact(NamedTuple):
     miss: float  # metres from the line of force
 
 
-def contact_on_axis(force: FloatArray, torque: FloatArray, triangles: FloatArray) -> ForceContact:
+def contact_on_axis(
+    force: FloatArray, torque: FloatArray, *, triangles: FloatArray
+) -> ForceContact:
     """Return the point of a body's surface where the line of a force on the body enters it.
 
     force (3,): newtons, not 0. torque (3,): newton metres about the origin. triangles (F, 3, 3):
@@ -121,10 +125,10 @@ def contact_on_axis(force: FloatArray, torque: FloatArray, triangles: FloatArray
     met = (sides >= 0.0).all(axis=1) | (sides <= 0.0).all(axis=1)
     enters = np.flatnonzero(met & (slope < 0.0))
     if len(enters) == 0:
-        return _nearest_edge(start, way, triangles, edges, normals)
+        return _nearest_edge(start, way, triangles=triangles, edges=edges, normals=normals)
     ahead = ((triangles[enters, 0] - start) * normals[enters]).sum(axis=1) / slope[enters]
     first = int(np.argmin(ahead))
-    return ForceContact(start + ahead[first] * way, _unit(normals[enters[first]]), 0.0)
+    return ForceContact(start + ahead[first] * way, _unit(normals[enters[first]]), miss=0.0)
 
 
 def contact_ahead(force: FloatArray, triangles: FloatArray) -> ForceContact:
@@ -136,12 +140,13 @@ def contact_ahead(force: FloatArray, triangles: FloatArray) -> ForceContact:
     way = _unit(force)
     vertices = np.unique(triangles.reshape(-1, 3), axis=0)
     ahead = -(vertices * way).sum(axis=1)
-    return ForceContact(vertices[ahead >= ahead.max() - _SAME].mean(axis=0), -way, 0.0)
+    return ForceContact(vertices[ahead >= ahead.max() - _SAME].mean(axis=0), -way, miss=0.0)
 
 
 def _nearest_edge(
     start: FloatArray,
     way: FloatArray,
+    *,
     triangles: FloatArray,
     edges: FloatArray,
     normals: FloatArray,
@@ -157,7 +162,7 @@ def _nearest_edge(
     away = ((from_line + part[..., None] * across) ** 2).sum(axis=-1)
     face, edge = np.unravel_index(int(np.argmin(away)), away.shape)
     point = triangles[face, edge] + part[face, edge] * edges[face, edge]
-    return ForceContact(point, _unit(normals[face]), float(np.sqrt(away[face, edge])))
+    return ForceContact(point, _unit(normals[face]), miss=float(np.sqrt(away[face, edge])))
 
 
 def _unit(vector: FloatArray) -> FloatArray:

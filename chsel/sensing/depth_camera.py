@@ -61,8 +61,8 @@ class PinholeCamera:
                 )
         require_positive("camera fx", self.fx)
         require_positive("camera fy", self.fy)
-        require_at_most("camera fx", self.fx, MOST_FOCUS)
-        require_at_most("camera fy", self.fy, MOST_FOCUS)
+        require_at_most("camera fx", self.fx, most=MOST_FOCUS)
+        require_at_most("camera fy", self.fy, most=MOST_FOCUS)
         if not (np.abs([self.cx, self.cy]) <= MOST_FOCUS).all():
             raise SettingError(
                 f"camera cx, cy are {self.cx}, {self.cy}; accepted: finite numbers up to "
@@ -70,7 +70,7 @@ class PinholeCamera:
             )
 
     @classmethod
-    def of_matrix(cls, matrix: Any, width: int, height: int) -> PinholeCamera:
+    def of_matrix(cls, matrix: Any, width: int, *, height: int) -> PinholeCamera:
         """Return the camera of a matrix (3, 3). Raise SettingError if it is not a pinhole's."""
         fx, fy, cx, cy = matrix_numbers(matrix)
         return cls(width, height, fx=fx, fy=fy, cx=cx, cy=cy)
@@ -118,7 +118,7 @@ class PinholeCamera:
             x, y = self.columns * depth, self.rows[:, None] * depth
         return np.stack([x, y, depth], axis=-1)
 
-    def image(self, name: str, values: Any, dtype: Any = np.float64) -> np.ndarray:
+    def image(self, name: str, values: Any, *, dtype: Any = np.float64) -> np.ndarray:
         """Return values (H, W) as an array. Raise PointsError for another shape."""
         values = np.asarray(values, dtype=dtype)
         if values.shape != (self.height, self.width):
@@ -137,7 +137,7 @@ def matrix_numbers(
     skew: the largest that is left out, of the focal length. Raise SettingError for a matrix that is
     not a pinhole camera's.
     """
-    matrix = frozen("camera", matrix, (3, 3), error=SettingError)
+    matrix = frozen("camera", matrix, shape=(3, 3), error=SettingError)
     fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
     off = np.abs(matrix - np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
     most = np.full((3, 3), _MATRIX_ROUNDING)
@@ -160,7 +160,7 @@ def valid_pixels(depth: FloatArray, *, nearest: float, furthest: float) -> BoolA
 
 
 def occlusion_edges(
-    depth: FloatArray, valid: BoolArray, jump: float, *, reach: int = 1
+    depth: FloatArray, valid: BoolArray, *, jump: float, reach: int = 1
 ) -> BoolArray:
     """Return pixels (H, W) that differ by more than `jump` metres from one of their neighbours.
 
@@ -188,7 +188,7 @@ class MainRegions(NamedTuple):
 
 
 def depth_regions(
-    depth: FloatArray, counts: BoolArray, camera: PinholeCamera, jump: float
+    depth: FloatArray, counts: BoolArray, *, camera: PinholeCamera, jump: float
 ) -> IntArray:
     """Return the region (H, W) of each pixel of a depth image, from 1; 0 where none counts.
 
@@ -200,8 +200,8 @@ def depth_regions(
     height, width = depth.shape
     cells = np.zeros((2 * height - 1, 2 * width - 1), dtype=bool)  # pixels, and links between them
     cells[::2, ::2] = counts
-    cells[::2, 1::2] = _linked(depth[:, 1:], depth[:, :-1], jump + _STEEPEST / camera.fx)
-    cells[1::2, ::2] = _linked(depth[1:], depth[:-1], jump + _STEEPEST / camera.fy)
+    cells[::2, 1::2] = _linked(depth[:, 1:], depth[:, :-1], share=jump + _STEEPEST / camera.fx)
+    cells[1::2, ::2] = _linked(depth[1:], depth[:-1], share=jump + _STEEPEST / camera.fy)
     return np.asarray(label(cells)[0][::2, ::2])
 
 
@@ -240,7 +240,7 @@ def main_regions(
     means of points on one object are.
     """
     if len(regions) == 0:
-        return MainRegions(np.zeros(0, dtype=bool), 0, 0)
+        return MainRegions(np.zeros(0, dtype=bool), 0, far=0)
     sizes = np.bincount(regions)
     sizes[0] = 0
     largest = int(np.argmax(sizes))
@@ -251,7 +251,7 @@ def main_regions(
         means = sums / np.maximum(sizes, 1)[:, None]
         far = ~small & (((means - means[largest]) ** 2).sum(axis=1) > diameter**2)
     kept: BoolArray = ~(small | far)[regions]
-    return MainRegions(kept, int(sizes[small].sum()), int(sizes[far].sum()))
+    return MainRegions(kept, int(sizes[small].sum()), far=int(sizes[far].sum()))
 
 
 def small_regions(regions: IntArray, least: int) -> BoolArray:
@@ -262,19 +262,20 @@ def small_regions(regions: IntArray, least: int) -> BoolArray:
 
 
 def speckle_free(
-    depth: FloatArray, valid: BoolArray, regions: IntArray, least: int
+    depth: FloatArray, valid: BoolArray, *, regions: IntArray, least: int
 ) -> tuple[FloatArray, int]:
     """Return depths (H, W) up to which rays are free, and how many pixels are in small regions.
 
     Pixels in regions of fewer than `least` pixels have the least depth of all valid ones (H, W)
     around them, so far that some are not of their region: if those are right, no ray is too long.
     """
-    speckles, depth = small_regions(regions, least), np.asarray(depth, np.float64)
+    speckles = small_regions(regions, least)
+    depth = np.asarray(depth, np.float64)
     around = _least_around(np.where(valid, depth, np.inf), isqrt(least) // 2 + 2)
     return np.where(speckles, around, depth), int(speckles.sum())
 
 
-def _linked(one: FloatArray, other: FloatArray, share: float) -> BoolArray:
+def _linked(one: FloatArray, other: FloatArray, *, share: float) -> BoolArray:
     """Return whether pairs of depths are connected; none is with 0."""
     nearer = np.minimum(one, other)
     return (nearer > 0.0) & (np.abs(one - other) <= share * nearer)
@@ -294,9 +295,9 @@ class DepthLook(NamedTuple):
 def depth_look(
     depth: Any,
     camera: PinholeCamera,
+    *,
     world_from_camera: Any,
     mask: Any = None,
-    *,
     before: float,
     side: float,
 ) -> DepthLook:
@@ -307,7 +308,7 @@ def depth_look(
     are left out. Raise PointsError for an image without a depth, or a mask without a pixel left.
     """
     pose = frozen(
-        "world_from_camera", world_from_camera, (4, 4), error=PoseError, most=FARTHEST_PLACE
+        "world_from_camera", world_from_camera, shape=(4, 4), error=PoseError, most=FARTHEST_PLACE
     )
     pose = nearest_rigid("world_from_camera", pose[None])[0]
     valid = valid_pixels(camera.image("depth", depth), nearest=0.0, furthest=np.inf)
@@ -316,13 +317,13 @@ def depth_look(
     if (nearest := float(depth[valid].min())) > _FARTHEST:
         raise PointsError(f"the nearest depth is {nearest:g} m: millimetres? accepted: metres")
     depth = np.where(valid, depth, 0.0)
-    rays = valid & ~occlusion_edges(depth, valid, _JUMP)
+    rays = valid & ~occlusion_edges(depth, valid, jump=_JUMP)
     surface = np.zeros((0, 3))
     if mask is not None:
-        mask = camera.image("mask", mask, bool)
+        mask = camera.image("mask", mask, dtype=bool)
         within = binary_erosion(mask, np.ones((3, 3)), iterations=_OUTLINE, border_value=1)
         on_object = within & rays
-        regions = depth_regions(depth, on_object, camera, _REGION_JUMP)
+        regions = depth_regions(depth, on_object, camera=camera, jump=_REGION_JUMP)
         on_object[on_object] = main_regions(regions[on_object], part=_PART).kept
         if not on_object.any():
             raise PointsError(
@@ -356,7 +357,7 @@ def one_per_voxel(points: FloatArray, side: float) -> FloatArray:
     return points[np.sort(nearest_first[first])]
 
 
-def outside_of(on_object: FloatArray, free: FloatArray, spacing: float) -> FloatArray:
+def outside_of(on_object: FloatArray, free: FloatArray, *, spacing: float) -> FloatArray:
     """Return free centres (N, 3) but for those that a measured surface point can lie behind.
 
     A ray that passes a voxel passes its centre at up to half the voxel's diagonal, so that nearer

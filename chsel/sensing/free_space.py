@@ -91,7 +91,9 @@ class FreeGrid:
         voxels = prod(self.shape)
         marks = np.zeros(voxels, dtype=np.uint8)  # in the current view
         self._seen = np.zeros(voxels, dtype=np.uint8)  # number of views, then _REPORTED
-        self._grid = MarkedVoxels(marks, self.shape, np.array(workspace.lower), float(spacing))
+        self._grid = MarkedVoxels(
+            marks, self.shape, lower=np.array(workspace.lower), spacing=float(spacing)
+        )
 
     def along_rays(self, origin: Any, ends: Any) -> int:
         """Mark, as one view, the segments from origin (3,) or (N, 3) to ends (N, 3), ends too.
@@ -108,9 +110,9 @@ class FreeGrid:
         self,
         depth: FloatArray,
         camera: PinholeCamera,
+        *,
         world_from_camera: FloatArray,
         mask: BoolArray,
-        *,
         fraction: float = 0.95,
     ) -> int:
         """Mark, as one view, the rays of the masked pixels up to `fraction` of their depth.
@@ -120,12 +122,13 @@ class FreeGrid:
         rigid.
         """
         require_positive("fraction", fraction)
-        move = frozen("world_from_camera", world_from_camera, (4, 4), error=PoseError)
-        check_rigid("world_from_camera", move[None], SENSOR_TOLERANCE)
-        mask = camera.image("mask", mask, bool)
+        move = frozen("world_from_camera", world_from_camera, shape=(4, 4), error=PoseError)
+        check_rigid("world_from_camera", move[None], tolerance=SENSOR_TOLERANCE)
+        mask = camera.image("mask", mask, dtype=bool)
         parts = camera.image("depth", depth), mask, camera.columns, camera.rows
         image = RayImage(*(np.require(part, requirements=("C", "W")) for part in parts))
-        pose, least = tuple(Poses.of(move[None]).numbers[0]), -(-_RAYS_PER_THREAD // camera.width)
+        pose = tuple(Poses.of(move[None]).numbers[0])
+        least = -(-_RAYS_PER_THREAD // camera.width)
         self._mark(mark_image, image, pose, float(fraction), count=camera.height, least=least)
         return self._settle(1)
 
@@ -135,8 +138,9 @@ class FreeGrid:
         These are free whatever the number of views. Return the number of voxels that became free.
         Raise PoseError for poses that are not finite.
         """
-        poses = frozen("poses", np.reshape(poses, (-1, 4, 4)), (None, 4, 4), error=PoseError)
-        points, least = _rows("points", points), -(-_POINTS_PER_THREAD // max(len(poses), 1))
+        poses = frozen("poses", np.reshape(poses, (-1, 4, 4)), shape=(None, 4, 4), error=PoseError)
+        points = _rows("points", points)
+        least = -(-_POINTS_PER_THREAD // max(len(poses), 1))
         self._mark(mark_points, points, Poses.of(poses).numbers, count=len(points), least=least)
         return self._settle(self._views)
 
@@ -152,7 +156,7 @@ class FreeGrid:
         def run(first: int, last: int, _: None) -> None:
             kernel(self._grid, *arguments, first, last)
 
-        parallel_for(run, count, lambda: None, least=least)
+        parallel_for(run, count, scratch=lambda: None, least=least)
 
     def _settle(self, views: int) -> int:
         """Count the marked voxels as seen in `views` more views; how many became free."""
@@ -365,11 +369,11 @@ def poses_between(poses: FloatArray, *, step: float, radius: float) -> FloatArra
     """
     require_positive("step", step)
     require_positive("radius", radius, zero=True)
-    poses = np.array(frozen("poses", poses, (None, 4, 4), error=PoseError))
+    poses = np.array(frozen("poses", poses, shape=(None, 4, 4), error=PoseError))
     if len(poses) == 0:
         return poses
-    check_rigid("poses", poses, SENSOR_TOLERANCE)
-    moves = _motion(poses[:-1], poses[1:], radius)
+    check_rigid("poses", poses, tolerance=SENSOR_TOLERANCE)
+    moves = _motion(poses[:-1], poses[1:], radius=radius)
     needed = len(poses) + float(moves.sum()) / step
     if not needed <= MOST_POSES:
         raise PoseError(
@@ -377,18 +381,18 @@ def poses_between(poses: FloatArray, *, step: float, radius: float) -> FloatArra
             f"accepted: at most {MOST_POSES:_}"
         )
     kept = poses[_thinned(moves, step)]
-    steps = _motion(kept[:-1], kept[1:], radius) / step
+    steps = _motion(kept[:-1], kept[1:], radius=radius) / step
     pieces = np.maximum(np.ceil(steps - _ROUNDING), 1.0).astype(np.int64)
     start = np.repeat(np.arange(len(pieces)), pieces)
     part = np.arange(len(start)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     path = kept[start]
     between = part > 0  # the given poses stay as they are
     fraction = (part / np.repeat(pieces, pieces))[between]
-    path[between] = interpolated(kept[start[between]], kept[start[between] + 1], fraction)
+    path[between] = interpolated(kept[start[between]], kept[start[between] + 1], fraction=fraction)
     return np.concatenate([path, kept[-1:]])
 
 
-def _motion(first: FloatArray, second: FloatArray, radius: float) -> FloatArray:
+def _motion(first: FloatArray, second: FloatArray, *, radius: float) -> FloatArray:
     """Return how far (N,) a point can move between poses (N, 4, 4): shift plus arc of the turn."""
     shift = second[:, :3, 3] - first[:, :3, 3]
     turn = product(np.swapaxes(first[:, :3, :3], 1, 2), second[:, :3, :3])
@@ -398,7 +402,8 @@ def _motion(first: FloatArray, second: FloatArray, radius: float) -> FloatArray:
 def _thinned(moves: FloatArray, step: float) -> list[int]:
     """Return indices of P poses, by the P - 1 moves between: each the last within one step."""
     path = np.concatenate([[0.0], np.cumsum(moves)])
-    kept, last = [0], len(path) - 1
+    kept = [0]
+    last = len(path) - 1
     while kept[-1] < last:
         reached = int(np.searchsorted(path, path[kept[-1]] + step, side="right")) - 1
         kept.append(max(reached, kept[-1] + 1))

@@ -30,7 +30,9 @@ def noise_of(method: Method) -> float:
     return settings.noise if isinstance(settings, AnchoredSettings) else SENSOR_NOISE
 
 
-def trust_by(method: Method, problem: RegistrationProblem, hypotheses: Hypotheses) -> Trust | None:
+def trust_by(
+    method: Method, problem: RegistrationProblem, *, hypotheses: Hypotheses
+) -> Trust | None:
     """Return how far to trust what a method found, by the noise in its settings.
 
     None without a pose. A single mode has to stand beside what a search for other poses finds,
@@ -44,21 +46,21 @@ def trust_by(method: Method, problem: RegistrationProblem, hypotheses: Hypothese
     noise = noise_of(method)
     carried = problem.carried(hypotheses.push_distance)
     rivals = None
-    trust = trust_in(carried, hypotheses, noise)
+    trust = trust_in(carried, hypotheses, sensor_noise=noise)
     searched = isinstance(method, Anchored) and len(carried.points.known) >= MANY_CONTACTS
     if trust.verdict == DETERMINED and not searched:
         rivals = _search(noise).minima(carried)
-        trust = trust_in(carried, hypotheses, noise, rivals)
-    if trust.verdict == DETERMINED and _fits_other_pushes(problem, hypotheses, noise):
+        trust = trust_in(carried, hypotheses, sensor_noise=noise, rivals=rivals)
+    if trust.verdict == DETERMINED and _fits_other_pushes(problem, hypotheses, noise=noise):
         reason = "pushes of another length fit elsewhere"
         trust = replace(trust, verdict=WIDE, modes=0, reason=reason)
-    poses, _ = explaining(carried, hypotheses, noise, rivals)
+    poses, _ = explaining(carried, hypotheses, sensor_noise=noise, rivals=rivals)
     centre, turn = pose_bound(carried.sdf, poses)
     return replace(trust, centre_within=centre, turn_within=turn)
 
 
 def unexpected_push(
-    method: Method, problem: RegistrationProblem, trust: Trust | None, pushes: Pushes | None
+    method: Method, problem: RegistrationProblem, *, trust: Trust | None, pushes: Pushes | None
 ) -> float:
     """Return by how much each touch seems to have moved the object, metres; or 0.
 
@@ -73,7 +75,9 @@ def unexpected_push(
     return _search(noise_of(method)).register(replace(problem, pushes=pushes)).push_distance
 
 
-def _fits_other_pushes(problem: RegistrationProblem, hypotheses: Hypotheses, noise: float) -> bool:
+def _fits_other_pushes(
+    problem: RegistrationProblem, hypotheses: Hypotheses, *, noise: float
+) -> bool:
     """Whether other poses explain the points as well where pushes have another distance."""
     if problem.pushes is None:
         return False
@@ -81,7 +85,9 @@ def _fits_other_pushes(problem: RegistrationProblem, hypotheses: Hypotheses, noi
     search = _search(noise)
     for distance in problem.pushes.distances:
         other = problem.carried(distance)
-        if fits_elsewhere(carried, hypotheses, other, search.minima(other), noise):
+        if fits_elsewhere(
+            carried, hypotheses, other=other, poses=search.minima(other), sensor_noise=noise
+        ):
             return True
     return False
 

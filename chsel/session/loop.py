@@ -109,7 +109,9 @@ class Loop:
         """
         points = KnownPoints() if points is None else points
         require_parts(sdf=sdf, workspace=workspace, points=points)
-        require_instance("settings", settings, OnlineSettings, "method.online of a method")
+        require_instance(
+            "settings", settings, kind=OnlineSettings, accepted="method.online of a method"
+        )
         require_positive("moves", moves, zero=True)
         if policy is not None and not callable(getattr(policy, "decide", None)):
             given = quoted(policy)
@@ -217,7 +219,7 @@ class Loop:
             return None
         directions = np.array([push.direction for push in self.state.pushes])
         before = np.array([push.before for push in self.state.pushes])
-        return Pushes(directions, before, largest)
+        return Pushes(directions, before, largest=largest)
 
     def remember(self, hypotheses: Hypotheses) -> None:
         """Let the next problem, and the next decision, follow from this result."""
@@ -225,9 +227,11 @@ class Loop:
 
     def offer(self, actions: Actions, hand: HandShape) -> ActionsOffered:
         """Let decisions choose among these actions; return the event that says so."""
-        require_instance("actions", actions, Actions, "chsel.Actions(world_from_hand, length)")
-        require_instance("hand", hand, HandShape, "chsel.HandShape.of(mesh)")
-        offered = ActionsOffered(self.state.step, actions, hand)
+        require_instance(
+            "actions", actions, kind=Actions, accepted="chsel.Actions(world_from_hand, length)"
+        )
+        require_instance("hand", hand, kind=HandShape, accepted="chsel.HandShape.of(mesh)")
+        offered = ActionsOffered(self.state.step, actions, hand=hand)
         self.state = replace(self.state, offered=offered)
         return offered
 
@@ -242,7 +246,7 @@ class Loop:
         problem = self.decision_problem(available)
         decision = self.policy.decide(problem)
         _check(problem, decision)
-        return Decided(self.state.step, problem, decision, surprise=self.state.surprise)
+        return Decided(self.state.step, problem, decision=decision, surprise=self.state.surprise)
 
     def follow(self, decided: Decided) -> None:
         """Let the next probe be the outcome of this decision."""
@@ -290,7 +294,13 @@ class Loop:
                 f"policy.belief.floor is {settings.floor:g}, above the workspace; accepted: a "
                 f"height below its top at {top:g} m, or null"
             )
-        return belief_before(self.sdf, self.state.points, self.workspace, self._next_key, settings)
+        return belief_before(
+            self.sdf,
+            self.state.points,
+            workspace=self.workspace,
+            key=self._next_key,
+            settings=settings,
+        )
 
     def end(self) -> None:
         """End the loop."""

@@ -65,7 +65,7 @@ class Perception(NamedTuple):
         }
         found: list[InputWarning] = []
         for name, points in places.items():
-            found += check_places(name, points, diameter, workspace)
+            found += check_places(name, points, diameter=diameter, workspace=workspace)
         return found if self.look is None else found + self.look.camera.check_centre()
 
 
@@ -112,20 +112,22 @@ class Intake:
         perception = perceived(**what, diameter=self.diameter, spacing=spacing)
         look = perception.look
         touching, found = distinct_points(
-            perception.touching, self._since, same_place(self.diameter)
+            perception.touching, self._since, apart=same_place(self.diameter)
         )
         seen = np.zeros((0, 3))
         if look is not None:
-            seen = look.surface[away_from(look.surface, self._seen, perception.spacing)]
+            seen = look.surface[away_from(look.surface, self._seen, apart=perception.spacing)]
         on_object = touching.merged(KnownPoints(known=seen))
         grid = self._grid
         given_workspace = None
         if grid is not None:
             given_workspace = started.workspace
             merged = points.merged(on_object)
-            check_points(merged, started.sdf.diameter, spacing, given_workspace)
+            check_points(
+                merged, started.sdf.diameter, free_resolution=spacing, workspace=given_workspace
+            )
         else:
-            check_points(on_object, started.sdf.diameter, spacing)
+            check_points(on_object, started.sdf.diameter, free_resolution=spacing)
             workspace = workspace_around(_first_places(perception, on_object), started.sdf)
             grid = FreeGrid(workspace, spacing)
             started = replace(started, workspace=workspace)
@@ -146,7 +148,7 @@ class Intake:
         if look is not None:
             farthest = farthest_depth(look, started.workspace)
             look = look._replace(ends=np.minimum(look.ends, farthest))
-            image = _image(step, look, farthest)
+            image = _image(step, look, farthest=farthest)
         return Prepared(
             started=started,
             grid=grid,
@@ -170,8 +172,10 @@ class Intake:
         surface = np.zeros((0, 3))
         if look is not None:
             surface = look.surface
-            grid.from_depth(look.ends, look.camera, look.pose, look.rays, fraction=1.0)
-        free = outside_of(surface, grid.new(), self._started.free_resolution)
+            grid.from_depth(
+                look.ends, look.camera, world_from_camera=look.pose, mask=look.rays, fraction=1.0
+            )
+        free = outside_of(surface, grid.new(), spacing=self._started.free_resolution)
         known = KnownPoints(free=free).merged(prepared.probe.new_points)
         probe = replace(prepared.probe, new_points=known)
         self._seen = np.concatenate([self._seen, prepared.seen])
@@ -242,14 +246,14 @@ def perceived(
         )
     touched = known_points(contacts=contacts).known
     if contact is not None:
-        contact = frozen("contact", contact, (3,), most=FARTHEST_PLACE)
+        contact = frozen("contact", contact, shape=(3,), most=FARTHEST_PLACE)
         touched = np.concatenate([touched, contact[None]])
     free_points = known_points(free=free).free
     others = known_points(occupied=occupied, known=known, known_sdf=known_sdf)
     nodes = np.zeros((0, 3))
     poses = swept = np.zeros((0, 4, 4))
     if path is not None:
-        poses = frozen("path", path, (None, 4, 4), error=PoseError, most=FARTHEST_PLACE)
+        poses = frozen("path", path, shape=(None, 4, 4), error=PoseError, most=FARTHEST_PLACE)
         poses = nearest_rigid("path", poses)
         bodies = hand_bodies(hand)
         nodes = interior_lattice(bodies, 0.5 * spacing)
@@ -264,9 +268,11 @@ def perceived(
         depth = _depths(depth)
         if not isinstance(camera, PinholeCamera):
             height, width = depth.shape
-            camera = PinholeCamera.of_matrix(camera, width, height)
+            camera = PinholeCamera.of_matrix(camera, width, height=height)
         mask = None if mask is None else _mask(mask)
-        look = depth_look(depth, camera, world_from_camera, mask, before=spacing, side=side)
+        look = depth_look(
+            depth, camera, world_from_camera=world_from_camera, mask=mask, before=spacing, side=side
+        )
     return Perception(
         contacts=touched,
         free=free_points,
@@ -283,10 +289,12 @@ def hand_bodies(hand: Any) -> list[trimesh.Trimesh]:
     """Return the bodies of a hand, turned outward. Raise MeshError for a mesh without faces."""
     import trimesh
 
-    require_instance("hand", hand, trimesh.Trimesh, "a mesh such as chsel.load_mesh(path)")
+    require_instance(
+        "hand", hand, kind=trimesh.Trimesh, accepted="a mesh such as chsel.load_mesh(path)"
+    )
     if len(hand.faces) == 0:
         raise MeshError("hand has no faces; accepted: a closed mesh, metres")
-    vertices = frozen("hand vertices", hand.vertices, (None, 3), error=MeshError)
+    vertices = frozen("hand vertices", hand.vertices, shape=(None, 3), error=MeshError)
     merged = trimesh.Trimesh(vertices, hand.faces)  # vertices at one place are one
     bodies = list(merged.split(only_watertight=False)) or [merged]
     for body in bodies:
@@ -307,7 +315,7 @@ def _depths(given: Any) -> FloatArray:
     """Return a depth image (H, W), metres; NaN where it is masked."""
     if np.ma.isMaskedArray(given):
         given = np.ma.asarray(given, np.float64).filled(np.nan)
-    depth = frozen("depth", given, (None, None), finite=False)
+    depth = frozen("depth", given, shape=(None, None), finite=False)
     whole = np.asarray(given).dtype.kind in "iu"
     if whole and (depth > _MOST_WHOLE).any() and (depth[depth > 0.0] <= _MOST_WHOLE).any():
         raise PointsError(
@@ -318,7 +326,7 @@ def _depths(given: Any) -> FloatArray:
 
 def _mask(given: Any) -> BoolArray:
     """Return flags (H, W) of pixels, from numbers of which one marks those of the object."""
-    mask = frozen("mask", given, (None, None))
+    mask = frozen("mask", given, shape=(None, None))
     values = np.unique(mask[mask != 0.0])
     if len(values) > 1:
         raise PointsError(
@@ -340,7 +348,7 @@ def _first_places(perception: Perception, on_object: KnownPoints) -> KnownPoints
     return passed
 
 
-def _image(step: int, look: DepthLook, farthest: float) -> SensorImage:
+def _image(step: int, look: DepthLook, *, farthest: float) -> SensorImage:
     """Return a depth image as recordings have it: without depths beyond the farthest, metres."""
     depth = np.where(look.depth > farthest, 0.0, look.depth)
     unit = _UNIT * np.ceil(max(float(depth.max()) / (65535 * _UNIT) - _ROUNDING, 1.0))

@@ -53,6 +53,7 @@ class StepObserver:
         self,
         recorder: Recorder,
         step: int,
+        *,
         snapshot_interval: int,
         show: Callable[[str, int, int], None],
     ) -> None:
@@ -63,19 +64,28 @@ class StepObserver:
         self._show = show
         self._mark = time.perf_counter()
 
-    def progress(self, stage: str, iteration: int, total: int) -> None:
+    def progress(self, stage: str, iteration: int, total: int) -> None:  # noqa: PLR0917
         """Show it, and count the time since the last report to the stage."""
         now = time.perf_counter()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._mark
         self._mark = now
         self._show(stage, iteration, total)
 
-    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:  # noqa: PLR0917
         """Record where the stage stands."""
-        ordered, half = np.sort(cost), len(cost) // 2  # faster than numpy's median
+        # faster than numpy's median
+        ordered = np.sort(cost)
+        half = len(cost) // 2
         median = ordered[half] if len(cost) % 2 else (ordered[half - 1] + ordered[half]) / 2.0
-        costs = (float(cost.min()), float(median), float(cost.max()))
-        traced = Traced(self._step, stage, iteration, digest(vectors, cost), *costs)
+        traced = Traced(
+            self._step,
+            stage,
+            iteration=iteration,
+            digest=digest(vectors, cost),
+            lowest_cost=float(cost.min()),
+            median_cost=float(median),
+            highest_cost=float(cost.max()),
+        )
         self._recorder.record(traced)
 
     def snapshot(self, archive: ArchiveSnapshot) -> None:
@@ -101,14 +111,16 @@ def register_recorded(
     belief after a result with a pose, where that is wanted.
     """
     recorder.record(posed)
-    observer = StepObserver(recorder, posed.step, snapshot_interval, show)
+    observer = StepObserver(recorder, posed.step, snapshot_interval=snapshot_interval, show=show)
     begun = time.perf_counter()
     hypotheses = method.register(posed.problem, observer)
     seconds = dict(observer.seconds)
     seconds["other"] = time.perf_counter() - begun - sum(observer.seconds.values())
-    trust = trust_by(method, posed.problem, hypotheses)
+    trust = trust_by(method, posed.problem, hypotheses=hypotheses)
     truth = None if symmetry is None else world_from_object
-    numbers = result_numbers(hypotheses, posed.problem, truth, symmetry, trust)
+    numbers = result_numbers(
+        hypotheses, posed.problem, world_from_object=truth, symmetry=symmetry, trust=trust
+    )
     results: list[Event] = [
         HypothesesFound(posed.step, hypotheses),
         Measured(posed.step, numbers),
@@ -167,7 +179,8 @@ class SessionRecorder(Recorder):
         try:
             call()
         except RecordingError as error:
-            self._error, self._failed = self._error or error, True
+            self._error = self._error or error
+            self._failed = True
 
     def _raise(self) -> None:
         error, self._error = self._error, None

@@ -59,17 +59,19 @@ def warm_up(method: Method) -> None:
         for problem in loop.problems(probes):
             hypotheses = method.register(problem)
             hypotheses = replace(hypotheses, trust=trust_in(problem, hypotheses))
-            result_numbers(hypotheses, problem, np.eye(4), None)
+            result_numbers(hypotheses, problem, world_from_object=np.eye(4), symmetry=None)
             Anchored(_brief(AnchoredSettings())).minima(problem)  # see trust_by
             loop.remember(hypotheses)
 
 
 def warm_up_sensing() -> None:
     """Compile the kernels of depth images and swept solids, or load them. See `warm_up`."""
-    grid, camera = FreeGrid(_WORKSPACE, 0.02), PinholeCamera(4, 3, 5.0, 5.0, 2.0, 1.5)
-    depth, mask = np.full((3, 4), 0.05), np.ones((3, 4), dtype=bool)
-    occlusion_edges(depth, mask, 0.1)
-    grid.from_depth(depth, camera, np.eye(4), mask)
+    grid = FreeGrid(_WORKSPACE, 0.02)
+    camera = PinholeCamera(4, 3, fx=5.0, fy=5.0, cx=2.0, cy=1.5)
+    depth = np.full((3, 4), 0.05)
+    mask = np.ones((3, 4), dtype=bool)
+    occlusion_edges(depth, mask, jump=0.1)
+    grid.from_depth(depth, camera, world_from_camera=np.eye(4), mask=mask)
     grid.along_rays(np.zeros(3), np.ones((1, 3)))
     grid.at(np.zeros((1, 3)))
 
@@ -102,7 +104,7 @@ def _ball() -> SdfGrid:
     nodes = np.indices((9, 9, 9)) * 0.01 - 0.04
     radius = np.sqrt((nodes**2).sum(axis=0))
     gradients = np.moveaxis(nodes / np.maximum(radius, 1e-9), 0, -1)
-    return SdfGrid(np.full(3, -0.04), 0.01, radius - _RADIUS, gradients)
+    return SdfGrid(np.full(3, -0.04), 0.01, values=radius - _RADIUS, gradients=gradients)
 
 
 def _brief(settings: Any) -> Any:

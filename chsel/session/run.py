@@ -170,7 +170,7 @@ class Run:
         """Record what happened; the new points of a Probe become known."""
         self.recorder.record(event)
         if isinstance(event, Logged) and event.level == "warning":
-            self.warnings.append(StepWarning(event.step, FROM_SESSION, event.text))
+            self.warnings.append(StepWarning(event.step, FROM_SESSION, text=event.text))
         if isinstance(event, Probe):
             self._perceive(event)
 
@@ -228,12 +228,12 @@ class Run:
     def fail(self, error: Exception) -> None:
         """Record why the step has no result."""
         failure = one_line(error)
-        self.recorder.record(Logged(self.step, "warning", f"{NO_RESULT}{failure}"))
+        self.recorder.record(Logged(self.step, "warning", text=f"{NO_RESULT}{failure}"))
         self.failure = failure
 
     def offer(self, actions: Actions, hand: HandShape) -> None:
         """Let decisions choose among these actions."""
-        self.recorder.record(ActionsOffered(self.step, actions, hand))
+        self.recorder.record(ActionsOffered(self.step, actions, hand=hand))
         self.loop.offer(actions, hand)
 
     def decide(self, available: BoolArray) -> Decided:
@@ -256,11 +256,13 @@ class Run:
         """
         if self.belief is None or self.answer is None or self.answer.trust is None:
             return False
-        self.grasp, self.grasp_chance = self.belief.best_grasp(object_from_gripper, width, gripper)
+        self.grasp, self.grasp_chance = self.belief.best_grasp(
+            object_from_gripper, width, gripper=gripper
+        )
         if self.grasp_chance < sure:
             return False
         text = f"stop: a grasp works with a chance of {self.grasp_chance:.2f}"
-        self.recorder.record(Logged(self.step, "info", text))
+        self.recorder.record(Logged(self.step, "info", text=text))
         self.stop = "grasp"
         return True
 
@@ -305,8 +307,8 @@ class Run:
         for warning in found:
             if warning.code not in {earlier.code for earlier in self.warnings}:
                 step = max(self.step, 0)
-                self.recorder.record(Logged(step, "warning", printable(warning.text)))
-                self.warnings.append(StepWarning(step, warning.code, warning.text))
+                self.recorder.record(Logged(step, "warning", text=printable(warning.text)))
+                self.warnings.append(StepWarning(step, warning.code, text=warning.text))
                 self._new_warnings.append(warning)
 
     def new_warnings(self) -> list[InputWarning]:
@@ -325,7 +327,7 @@ class Run:
         level = "info" if outcome == "finished" else "warning"
         self.loop.end()
         try:
-            self.recorder.record(Logged(step, level, f"session {outcome}"))
+            self.recorder.record(Logged(step, level, text=f"session {outcome}"))
             self.recorder.record(SessionEnded(step, outcome))
         finally:
             self.recorder.close()

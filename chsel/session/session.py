@@ -156,8 +156,10 @@ class Session:
             require_parts(workspace=workspace)
             grid = FreeGrid(workspace, free_resolution)
         sdf = object_grid(mesh, resolution)
-        require_metres("noise", noise_of(method), MOST_NOISE * sdf.diameter, sdf.diameter)
-        require_metres("moves", moves, sdf.diameter, sdf.diameter)
+        require_metres(
+            "noise", noise_of(method), most=MOST_NOISE * sdf.diameter, diameter=sdf.diameter
+        )
+        require_metres("moves", moves, most=sdf.diameter, diameter=sdf.diameter)
         grid_settings = {  # by which a damaged grid can be made again
             "object_resolution": None if resolution is None else float(resolution),
             "object_padding": OBJECT_PADDING,
@@ -395,7 +397,7 @@ class Session:
         hand = self._require_hand()
         self._require_workspace()
         settings = settings or self._policy.settings.actions
-        return around_actions(settings, self.started.workspace, hand)
+        return around_actions(settings, self.started.workspace, hand=hand)
 
     @_locked
     def next_probe(
@@ -432,7 +434,7 @@ class Session:
         if actions is None:
             actions = self.actions() if offered is None else offered.actions
         accepted = "chsel.Actions(world_from_hand, length)"
-        require_instance("actions", actions, Actions, accepted)
+        require_instance("actions", actions, kind=Actions, accepted=accepted)
         if not set(without) <= set(range(len(actions))):
             raise SettingError(f"without is {without}; accepted: indices below {len(actions)}")
         self._require_workspace()
@@ -475,7 +477,7 @@ class Session:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
+    def __exit__(  # noqa: PLR0917
         self,
         kind: type[BaseException] | None,
         error: BaseException | None,
@@ -530,7 +532,9 @@ def _mesh(name: str, given: Any) -> trimesh.Trimesh:
     """Return what was given, if it is a mesh."""
     import trimesh
 
-    require_instance(name, given, trimesh.Trimesh, "a mesh such as chsel.load_mesh(path)")
+    require_instance(
+        name, given, kind=trimesh.Trimesh, accepted="a mesh such as chsel.load_mesh(path)"
+    )
     return given
 
 

@@ -87,7 +87,8 @@ def run(command: str) -> None:
 @contextmanager
 def viewer_on(folder: str, size: str) -> Iterator[int]:
     """The port of a viewer without a screen that has read the recording in a folder."""
-    port, rrd = free_port(), f"{folder}/recording.rrd"
+    port = free_port()
+    rrd = f"{folder}/recording.rrd"
     options = ["--headless", "--hide-welcome-screen", "--bind", "127.0.0.1", "--port", str(port)]
     command = [str(viewer_program()), *options, "--window-size", size, rrd]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -116,15 +117,19 @@ def asked(port: int, question: Callable[[ViewerClient], Any]) -> Any:
 def picture(port: int, step: int, **shown: Any) -> Image.Image:
     """What is shown at a probe, as soon as nothing changes any more."""
     asked(port, lambda client: client.set_time("probe", sequence=step, play_state="paused"))
-    last, png = b"", asked(port, lambda client: client.take_screenshot(**shown))
+    last = b""
+    png = asked(port, lambda client: client.take_screenshot(**shown))
     while png != last:
-        last, png = png, asked(port, lambda client: client.take_screenshot(**shown))
+        last = png
+        png = asked(port, lambda client: client.take_screenshot(**shown))
     return Image.open(io.BytesIO(png)).convert("RGB")
 
 
 def session(folder: str, path: str) -> None:
     """The scene of a session, probe by probe."""
-    frames, contacts, font = [], 0, ImageFont.load_default(22.0)
+    frames = []
+    contacts = 0
+    font = ImageFont.load_default(22.0)
     with viewer_on(folder, "1920x1200") as port:
         views = asked(port, lambda client: client.get_state().views)
         (scene,) = [view.view_id for view in views if view.name == "Scene"]
@@ -135,7 +140,7 @@ def session(folder: str, path: str) -> None:
             ImageDraw.Draw(frame).text((16, 12), text, fill="#e6e8ec", font=font)
             size = 720, round(frame.height * 720 / frame.width)
             frames.append(frame.resize(size, Image.Resampling.LANCZOS))
-    webp(frames, [400] * (len(frames) - 1) + [2500], path)
+    webp(frames, [400] * (len(frames) - 1) + [2500], path=path)
 
 
 def main(*names: str) -> None:

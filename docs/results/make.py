@@ -30,7 +30,8 @@ from runners.reporting.ranking import KEPT, stored_names
 from runners.reporting.tables import Table, number, percent, percent_range, with_range
 from runners.sessions.faults import LEVELS
 
-HERE, DOCS = Path(__file__).parent, Path(__file__).parents[1]
+HERE = Path(__file__).parent
+DOCS = Path(__file__).parents[1]
 _NAMES = ("results", "results_paper", "results_probing", "benchmark")
 PAGES = {HERE / f"{name}.md.j2": DOCS / f"{name}.md" for name in _NAMES}
 README = DOCS.parent / "README.md"
@@ -57,7 +58,7 @@ def _markdown(table: Table, without: Sequence[str] = ()) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
-def table(name: str, title: str, baseline: str | None = None, without: str = "") -> str:
+def table(name: str, title: str, *, baseline: str | None = None, without: str = "") -> str:
     """A table of the report of an evaluation, by its title; without: columns, by semicolons."""
     found = [
         table
@@ -88,14 +89,16 @@ def _chosen(rows: pd.DataFrame, where: Mapping[str, Any]) -> pd.DataFrame:
     return rows
 
 
-def ratio(name: str, method: str, to: str, **where: Any) -> str:
+def ratio(name: str, method: str, *, to: str, **where: Any) -> str:
     """PD by that of another method at the same steps; what may be 1 is said to be within noise."""
     own = _chosen(_with_ratios(name, to), {"method": method, **where})
     mean, lower, upper = statistics.ratio_interval(own)
-    return with_range(mean, lower, upper) + (", within noise" if lower <= 1.0 <= upper else "")
+    return with_range(mean, lower, upper=upper) + (
+        ", within noise" if lower <= 1.0 <= upper else ""
+    )
 
 
-def worse(name: str, methods: list[str], to: str) -> str:
+def worse(name: str, methods: list[str], *, to: str) -> str:
     """Whether methods have a higher PD than another one, beyond their intervals."""
     intervals = [
         statistics.ratio_interval(_chosen(_with_ratios(name, to), {"method": method}))
@@ -106,7 +109,7 @@ def worse(name: str, methods: list[str], to: str) -> str:
     return "no" if all(upper < 1.0 for *_, upper in intervals) else "within noise"
 
 
-def better(name: str, method: str, than: str, **where: Any) -> str:
+def better(name: str, method: str, *, than: str, **where: Any) -> str:
     """The share of steps at which a method has a lower PD than another one."""
     own = _chosen(_with_ratios(name, than), {"method": method, **where})["ratio"].dropna()
     return percent((own < 1.0 - 1e-9).mean())
@@ -122,12 +125,12 @@ def median(name: str, column: str, **where: Any) -> str:
     return number(numbers(name, column, **where).median())
 
 
-def share(name: str, column: str, below: float | None = None, **where: Any) -> str:
+def share(name: str, column: str, *, below: float | None = None, **where: Any) -> str:
     """Of rows with a flag, or with a number below a limit; Wilson's interval."""
     values = numbers(name, column, **where)
     flags = values > 0.5 if below is None else values < below
     frame = pd.DataFrame({"all": 0, "flag": flags})
-    return percent_range(statistics.shares(frame, "all", "flag").iloc[0])
+    return percent_range(statistics.shares(frame, "all", column="flag").iloc[0])
 
 
 def mean_share(name: str, column: str, **where: Any) -> str:
@@ -181,7 +184,7 @@ def levels(name: str) -> list[str]:
     return [level for level in LEVELS if level in there]
 
 
-def moment(method: str, iteration: int, column: str = "diversity") -> str:
+def moment(method: str, iteration: int, *, column: str = "diversity") -> str:
     """Median of the searches of `paper_qd` after so many iterations."""
     rows = evaluation("paper_qd").iterations
     own = rows[(rows["method"] == method) & (rows["iteration"] == iteration)]
@@ -279,7 +282,8 @@ def write(checked: bool = False) -> list[Path]:
 
 def main(arguments: list[str]) -> None:
     """See above."""
-    verb, folders = (arguments or ["write"])[0], [Path(name) for name in arguments[1:]]
+    verb = (arguments or ["write"])[0]
+    folders = [Path(name) for name in arguments[1:]]
     if verb not in ("write", "store") or bool(folders) != (verb != "write"):
         sys.exit(f"{' '.join(arguments)} is none of:\n{__doc__}")
     for folder in folders:

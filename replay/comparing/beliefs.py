@@ -17,19 +17,20 @@ class BeliefSequence:
 
     def __init__(self, recording: Recording) -> None:
         """Raises RecordingError if the recording does not have the settings of its method."""
-        self._method, self._start = recorded_method(recording).build(), recording.start
+        self._method = recorded_method(recording).build()
+        self._start = recording.start
         self._last: PoseBelief | None = None
 
     def after(self, problem: RegistrationProblem, found: Hypotheses) -> PoseBelief | None:
         """Return the belief after one more result; None for one without a pose."""
-        trust = trust_by(self._method, problem, found)
+        trust = trust_by(self._method, problem, hypotheses=found)
         if trust is None:
             return None
         self._last = PoseBelief(
             self._start.sdf,
             replace(found, trust=trust),
-            object_symmetry(self._start.mesh),
-            self._last,
+            symmetry=object_symmetry(self._start.mesh),
+            previous=self._last,
             problem=problem,
             noise=noise_of(self._method),
         )

@@ -33,8 +33,12 @@ class Choosable(NamedTuple, Generic[Made]):
     build: Callable[..., Made]
 
 
-METHOD: Choosable[Method] = Choosable("method", METHODS, preset_settings, build_method)
-POLICY: Choosable[Policy] = Choosable("policy", POLICIES, policy_settings, build_policy)
+METHOD: Choosable[Method] = Choosable(
+    "method", METHODS, settings=preset_settings, build=build_method
+)
+POLICY: Choosable[Policy] = Choosable(
+    "policy", POLICIES, settings=policy_settings, build=build_policy
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +80,9 @@ def is_recorded(recording: Recording, choice: Choice[Any]) -> bool:
         return False
 
 
-def chosen(recording: Recording, kind: Choosable[Made], words: Sequence[str]) -> list[Choice[Made]]:
+def chosen(
+    recording: Recording, kind: Choosable[Made], *, words: Sequence[str]
+) -> list[Choice[Made]]:
     """Return methods or policies by labels such as "chsel@paper" or "chsel#small", and changes.
 
     Without a preset, settings are those of the recording for its own method or policy, else those
@@ -90,10 +96,10 @@ def chosen(recording: Recording, kind: Choosable[Made], words: Sequence[str]) ->
     for label in labels:
         if label in choices:
             raise SettingError(f"{label} is named twice; accepted: {LABELS_HELP}")
-        choices[label] = _choice(recording, kind, label)
+        choices[label] = _choice(recording, kind, label=label)
     for word in words:
         if "=" in word:
-            _change(choices, kind, word)
+            _change(choices, kind, word=word)
     return list(choices.values())
 
 
@@ -107,29 +113,32 @@ def _recorded(recording: Recording, kind: Choosable[Made]) -> Choice[Made]:
         )
     try:
         settings = {key: value for key, value in config.items() if key != "name"}
-        made = changed_settings(kind.settings(name), settings, kind.name)
-        return Choice(kind, name, name, made)
+        made = changed_settings(kind.settings(name), settings, where=kind.name)
+        return Choice(kind, name, name=name, settings=made)
     except SettingError as error:
         raise RecordingError(f"recording {recording.path}: {error}") from error
 
 
-def _choice(recording: Recording, kind: Choosable[Made], label: str) -> Choice[Made]:
+def _choice(recording: Recording, kind: Choosable[Made], *, label: str) -> Choice[Made]:
     """Return the choice that a label names, before any change."""
     match = _LABEL.fullmatch(label)
     if match is None:
         raise SettingError(f"{label!r} is not a {kind.name}; accepted: {LABELS_HELP}")
     name, preset = match["name"], match["preset"]
-    require_choice(kind.name, name, kind.names)
+    require_choice(kind.name, name, accepted=kind.names)
     config = recording.start.config
-    group, recorded = config.get("preset"), config.get(kind.name)
+    group = config.get("preset")
+    recorded = config.get(kind.name)
     if preset is None and isinstance(recorded, Mapping) and recorded.get("name") == name:
-        return Choice(kind, label, name, _recorded(recording, kind).settings)
+        return Choice(kind, label, name=name, settings=_recorded(recording, kind).settings)
     usual = group.get("name") if isinstance(group, Mapping) else None
     usual = usual if usual in PRESETS else "default"
-    return Choice(kind, label, name, kind.settings(name, preset or usual), preset or "")
+    return Choice(
+        kind, label, name=name, settings=kind.settings(name, preset or usual), preset=preset or ""
+    )
 
 
-def _change(choices: dict[str, Choice[Made]], kind: Choosable[Made], word: str) -> None:
+def _change(choices: dict[str, Choice[Made]], kind: Choosable[Made], *, word: str) -> None:
     """Lay a change over the settings of all labels that have it, or of the one that it names."""
     place, _, text = word.partition("=")
     one, colon, key = place.rpartition(":")
@@ -150,11 +159,13 @@ def _change(choices: dict[str, Choice[Made]], kind: Choosable[Made], word: str) 
     for label in having or asked[:1]:
         choice = choices[label]
         try:
-            settings = changed_settings(choice.settings, value, kind.name)
+            settings = changed_settings(choice.settings, value, where=kind.name)
         except SettingError as error:
             raise SettingError(f"{label}: {error}") from None
         changes = (*choice.changes, f"{key}={text}")
-        choices[label] = Choice(kind, label, choice.name, settings, choice.preset, changes)
+        choices[label] = Choice(
+            kind, label, name=choice.name, settings=settings, preset=choice.preset, changes=changes
+        )
 
 
 def _has(settings: Any, keys: Sequence[str]) -> bool:

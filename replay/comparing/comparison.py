@@ -47,26 +47,35 @@ class Column(NamedTuple):
 
 _DEGREES = math.degrees(1.0)
 COLUMNS: Mapping[str, Column] = {
-    "best_cost": Column("best_cost", "best cost", "best\ncost"),
-    "median_cost": Column("median_cost", "median cost", "median\ncost"),
+    "best_cost": Column("best_cost", "best cost", heading="best\ncost"),
+    "median_cost": Column("median_cost", "median cost", heading="median\ncost"),
     "hypotheses": Column("hypotheses", "hypotheses"),
-    "distinct": Column("distinct", "distinct hypotheses", "dis-\ntinct"),
+    "distinct": Column("distinct", "distinct hypotheses", heading="dis-\ntinct"),
     "best_position_error": Column(
-        "best_position_error_m", "position error of the best, mm", "best\nmm", 1e3
+        "best_position_error_m", "position error of the best, mm", heading="best\nmm", times=1e3
     ),
     "best_rotation_error": Column(
-        "best_rotation_error_rad", "rotation error of the best, °", "best\n°", _DEGREES
+        "best_rotation_error_rad",
+        "rotation error of the best, °",
+        heading="best\n°",
+        times=_DEGREES,
     ),
     "closest_position_error": Column(
-        "closest_position_error_m", "position error of the closest, mm", "near\nmm", 1e3
+        "closest_position_error_m",
+        "position error of the closest, mm",
+        heading="near\nmm",
+        times=1e3,
     ),
     "closest_rotation_error": Column(
-        "closest_rotation_error_rad", "rotation error of the closest, °", "near\n°", _DEGREES
+        "closest_rotation_error_rad",
+        "rotation error of the closest, °",
+        heading="near\n°",
+        times=_DEGREES,
     ),
-    "coverage": Column("coverage_mm2", "coverage, mm²", "cover-\nage"),
-    "plausibility": Column("plausibility_mm2", "plausibility, mm²", "plausi-\nbility"),
-    "diversity": Column("diversity_mm2", "plausible diversity, mm²", "PD\nmm²"),
-    "seconds": Column("seconds_s", "time, ms", "ms", 1e3),
+    "coverage": Column("coverage_mm2", "coverage, mm²", heading="cover-\nage"),
+    "plausibility": Column("plausibility_mm2", "plausibility, mm²", heading="plausi-\nbility"),
+    "diversity": Column("diversity_mm2", "plausible diversity, mm²", heading="PD\nmm²"),
+    "seconds": Column("seconds_s", "time, ms", heading="ms", times=1e3),
 }
 """Columns by the names of `Outcome.numbers`, in the order in which they are shown."""
 
@@ -115,10 +124,10 @@ def recorded_label(recording: Recording) -> str:
 def compared(
     recording: Recording,
     methods: Sequence[Choice[Method]],
+    *,
     steps: Sequence[int],
     cost: CommonCost,
     plausible: PlausibleSets | None = None,
-    *,
     out: Path | None = None,
 ) -> Iterator[Outcome]:
     """Yield outcomes step by step: the recorded one, then one of each method in turn.
@@ -131,34 +140,48 @@ def compared(
     for method in built.values():
         warm_up(method)  # so that no time holds the compiling of kernels
     for posed in _problems(recording, steps):
-        step, judge = posed.step, CompiledCost.of(posed.problem, cost.settings)
-        sets = (judge, recording.start_at(posed.step), posed.problem, plausible)
+        step = posed.step
+        judge = CompiledCost.of(posed.problem, cost.settings)
+        start = recording.start_at(posed.step)
         recorded = recording.hypotheses(step) if recording.has_result(step) else None
-        numbers = {} if recorded is None else _all_numbers(recorded, *sets)
+        numbers = (
+            {}
+            if recorded is None
+            else _all_numbers(
+                recorded, judge, start=start, problem=posed.problem, plausible=plausible
+            )
+        )
         failure = "" if recorded is not None else "no result was recorded"
-        yield Outcome(step, recorded_label(recording), recorded, numbers, failure)
+        yield Outcome(
+            step, recorded_label(recording), hypotheses=recorded, numbers=numbers, failure=failure
+        )
         for choice in methods:
             try:
-                with _recorder(recording, step, choice, out) as recorder:
-                    registered = _register(recording, posed, built[choice.label], recorder)
+                with _recorder(recording, step, choice=choice, out=out) as recorder:
+                    registered = _register(
+                        recording, posed, method=built[choice.label], recorder=recorder
+                    )
                 found = registered.hypotheses
-                numbers = _all_numbers(found, *sets) | {"seconds": registered.total_seconds}
+                numbers = _all_numbers(
+                    found, judge, start=start, problem=posed.problem, plausible=plausible
+                ) | {"seconds": registered.total_seconds}
             except Exception as error:  # the others go on
                 if out is not None:
                     raise
                 known = isinstance(error, ChselError)
                 failure = str(error) if known else f"{type(error).__name__}: {error}"
-                yield Outcome(step, choice.label, None, failure=failure)
+                yield Outcome(step, choice.label, hypotheses=None, failure=failure)
                 continue
             same = None
             if recorded is not None and is_recorded(recording, choice):
                 same = _digests(found) == _digests(recorded)
-            yield Outcome(step, choice.label, found, numbers, as_recorded=same)
+            yield Outcome(step, choice.label, hypotheses=found, numbers=numbers, as_recorded=same)
 
 
 def frame(
     outcomes: Sequence[Outcome],
     methods: Sequence[Choice[Method]],
+    *,
     cost: CommonCost,
     definition: str,
 ) -> pd.DataFrame:
@@ -172,7 +195,8 @@ def frame(
     by_label = {choice.label: choice for choice in methods}
     rows = []
     for outcome in outcomes:
-        choice, numbers = by_label.get(outcome.label), outcome.numbers
+        choice = by_label.get(outcome.label)
+        numbers = outcome.numbers
         rows.append(
             {
                 "step": outcome.step,
@@ -196,7 +220,7 @@ def write_csv(rows: pd.DataFrame, path: Path) -> None:
 
 
 def numbers_under(
-    cost: CompiledCost, hypotheses: Hypotheses, start: SessionStarted
+    cost: CompiledCost, hypotheses: Hypotheses, *, start: SessionStarted
 ) -> dict[str, float]:
     """Return numbers about hypotheses, by a cost that may be another than their method's.
 
@@ -213,8 +237,8 @@ def numbers_under(
     numbers["median_cost"] = float(np.median(costs))
     if start.world_from_object is not None:
         symmetry = object_symmetry(start.mesh)
-        position, rotation = pose_errors(poses, start.world_from_object, symmetry)
-        closest = closest_pose(poses, start.world_from_object, start.sdf)
+        position, rotation = pose_errors(poses, start.world_from_object, symmetry=symmetry)
+        closest = closest_pose(poses, start.world_from_object, sdf=start.sdf)
         for name, index in (("best", best), ("closest", closest)):
             numbers[f"{name}_position_error"] = float(position[index])
             numbers[f"{name}_rotation_error"] = float(rotation[index])
@@ -224,11 +248,12 @@ def numbers_under(
 def _all_numbers(
     found: Hypotheses,
     judge: CompiledCost,
+    *,
     start: SessionStarted,
     problem: RegistrationProblem,
     plausible: PlausibleSets | None,
 ) -> dict[str, float]:
-    about = numbers_under(judge, found, start)
+    about = numbers_under(judge, found, start=start)
     return about if plausible is None else about | plausible.numbers(problem, found)
 
 
@@ -242,7 +267,7 @@ def _problems(recording: Recording, steps: Sequence[int]) -> Iterator[ProblemPos
 
 
 def _register(
-    recording: Recording, posed: ProblemPosed, method: Method, recorder: Recorder
+    recording: Recording, posed: ProblemPosed, *, method: Method, recorder: Recorder
 ) -> Registered:
     start = recording.start
     return register_recorded(
@@ -257,7 +282,7 @@ def _register(
 
 @contextmanager
 def _recorder(
-    recording: Recording, step: int, choice: Choice[Method], out: Path | None
+    recording: Recording, step: int, *, choice: Choice[Method], out: Path | None
 ) -> Iterator[Recorder]:
     """Open the recorder of a registration: a new file with the probes before it, or none."""
     if out is None:
@@ -302,9 +327,9 @@ class PlausibleSets:
     """
 
     def __init__(
-        self, recording: Recording, folder: Path | None = None, definition: str = "default"
+        self, recording: Recording, folder: Path | None = None, *, definition: str = "default"
     ) -> None:
-        require_choice("definition", definition, DEFINITIONS)
+        require_choice("definition", definition, accepted=DEFINITIONS)
         if folder is not None and not folder.is_dir():
             raise RecordingError(f"{folder} is not a folder; accepted: one with plausible sets")
         self._folder = folder or recording.path.parent / "plausible"
@@ -314,8 +339,8 @@ class PlausibleSets:
     @cached_property
     def _distance(self) -> SurfaceDistance:
         start = self._start
-        points = surface_points(start.mesh, DistanceSettings().points, StreamKey(start.seed, 0))
-        return SurfaceDistance(start.sdf, start.mesh, points)
+        points = surface_points(start.mesh, DistanceSettings().points, key=StreamKey(start.seed, 0))
+        return SurfaceDistance(start.sdf, start.mesh, points=points)
 
     def numbers(self, problem: RegistrationProblem, hypotheses: Hypotheses) -> dict[str, float]:
         """Return coverage, plausibility and PD in mm^2 (CHSEL, Sec. V), nothing without a set.

@@ -52,13 +52,13 @@ class Difference:
 def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[Difference]:
     """Return the differences between two contents, in the order of the first."""
     pairs = (
-        difference(name, first.get(name, ABSENT), second.get(name, ABSENT))
+        difference(name, first.get(name, ABSENT), second=second.get(name, ABSENT))
         for name in dict.fromkeys([*first, *second])
     )
     return [found for found in pairs if found is not None]
 
 
-def difference(name: str, first: Any, second: Any) -> Difference | None:
+def difference(name: str, first: Any, *, second: Any) -> Difference | None:
     """Return how two values differ, or None if they have the same type and the same bits."""
     if _is_equal(first, second):
         return None
@@ -162,13 +162,16 @@ class ResultDifferences:
 
 def result_differences(recorded: Sequence[Event], other: Sequence[Event]) -> ResultDifferences:
     """Compare the events of two registrations, or two decisions, in the order of the recorded."""
-    found, others = ResultDifferences(), _by_stage(other)
+    found = ResultDifferences()
+    others = _by_stage(other)
     for stage, values in _by_stage(recorded).items():
         if stage not in others:
             found.add(f"{stage}, which does not come about")
             continue
-        pair = values, others[stage]
-        differing = differences(*(_out_of_tolerance(*pair) if stage == MEASURED else pair))
+        left, right = values, others[stage]
+        if stage == MEASURED:
+            left, right = _out_of_tolerance(left, right)
+        differing = differences(left, right)
         if not differing:
             found.before += not found.stage
         elif "digest" in values or (stage.startswith("archive") and found.stage):
@@ -255,12 +258,12 @@ def _by_stage(events: Sequence[Event]) -> dict[str, Content]:
 
 def _out_of_tolerance(recorded: Content, other: Content) -> tuple[Content, Content]:
     """Return the recorded numbers that the other lacks, or has outside their tolerance."""
-    far = [name for name in recorded if not is_close(recorded[name], other.get(name), name)]
+    far = [name for name in recorded if not is_close(recorded[name], other.get(name), name=name)]
     one, two = ({name: of[name] for name in far if name in of} for of in (recorded, other))
     return one, two
 
 
-def is_close(recorded: float, other: float | None, name: str) -> bool:
+def is_close(recorded: float, other: float | None, *, name: str) -> bool:
     """Return whether a measured number of this name may be in place of the recorded one."""
     if other is None:
         return False

@@ -67,7 +67,7 @@ def recomputed(
     ones, images are left out, and it is checked at which steps the session registers. Raise
     RecordingError if the recording does not have the settings of its method or policy.
     """
-    session = _Recomputation(recording, steps, follow_computed)
+    session = _Recomputation(recording, steps, follow_computed=follow_computed)
     group: list[Event] = []
     for event in recording.events(images=follow_computed):
         if group and isinstance(event, (*_RESULTS, Logged)):
@@ -97,7 +97,7 @@ class _Recomputation:
     """A loop over recorded events, and what differs from them."""
 
     def __init__(
-        self, recording: Recording, steps: Container[int] | None, follow_computed: bool
+        self, recording: Recording, steps: Container[int] | None, *, follow_computed: bool
     ) -> None:
         self._recording = recording
         self._steps = steps
@@ -225,7 +225,7 @@ class _Recomputation:
             problem = replace(problem, verdict="")
         decision = policy.decide(problem if self._follow_computed else recorded)
         surprise = self._loop.state.surprise if self._is_surprise_known else decided.surprise
-        return Decided(decided.step, problem, decision, surprise)
+        return Decided(decided.step, problem, decision=decision, surprise=surprise)
 
     def _registration(
         self, posed: ProblemPosed, recorded: Sequence[Event], *, has_result: bool

@@ -17,7 +17,9 @@ from replay.comparing.recomputation import Recomputed, recomputed, result_in
 from replay.environment import environment_differences
 from replay.mcap.reader import Recording, read_recording
 
-EQUAL, DIFFERS, NO_RESULT = "equal", "differs", "no result"
+EQUAL = "equal"
+DIFFERS = "differs"
+NO_RESULT = "no result"
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Verdict:
     @classmethod
     def of(cls, found: Recomputed, environment: tuple[str, ...]) -> Verdict:
         """Return the verdict on what was recomputed."""
-        about = cls(found.step, found.name, found.is_decision, EQUAL)
+        about = cls(found.step, found.name, is_decision=found.is_decision, outcome=EQUAL)
         has_no_result = not found.is_decision and result_in(found.recorded) is None
         if found.recorded and has_no_result:
             return replace(about, outcome=NO_RESULT)
@@ -137,7 +139,8 @@ def verified_files(
 
 
 def _verified(path: Path, steps: Sequence[int] | None) -> FileVerdict:
-    begun, file = time.perf_counter(), FileVerdict(path)
+    begun = time.perf_counter()
+    file = FileVerdict(path)
     try:
         recording = read_recording(path)
         file.digest = recording.digest

@@ -72,14 +72,14 @@ def mesh_from_ply(data: bytes) -> trimesh.Trimesh:
 def mesh_attached(attachments: Mapping[str, bytes], digest: str) -> trimesh.Trimesh:
     """Return the mesh among attachments; raise RecordingError unless it has the digest."""
     mesh = mesh_from_ply(_data(attachments, MESH))
-    check_digest(f"attachment {MESH}", mesh_digest(mesh), digest)
+    check_digest(f"attachment {MESH}", mesh_digest(mesh), recorded=digest)
     return mesh
 
 
 def sdf_attached(attachments: Mapping[str, bytes], digest: str) -> SdfGrid:
     """Return the SDF grid among attachments, likewise."""
     sdf = SdfGrid(**decode("SdfGrid", _data(attachments, SDF_GRID)))
-    check_digest(f"attachment {SDF_GRID}", sdf.digest, digest)
+    check_digest(f"attachment {SDF_GRID}", sdf.digest, recorded=digest)
     return sdf
 
 

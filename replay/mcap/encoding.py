@@ -97,7 +97,7 @@ def encode(name: str, values: Mapping[str, Any]) -> bytes:
     Raise RecordingError if a value does not have the type or shape that the table gives.
     """
     message: Any = message_class(name)()
-    _fill(message, name, values)
+    _fill(message, name, values=values)
     data: bytes = message.SerializeToString(deterministic=True)
     return data
 
@@ -153,35 +153,35 @@ def _check_fields(name: str, values: Mapping[str, Any]) -> None:
         TOGETHER[name](values)
 
 
-def _fill(message: Any, name: str, values: Mapping[str, Any]) -> None:
+def _fill(message: Any, name: str, *, values: Mapping[str, Any]) -> None:
     lengths: dict[str, int] = {}
     for field, kind in field_kinds(name).items():
         value = values[field]
         if value is None and kind.optional:
             continue
         try:
-            _set(message, field, kind, value, lengths)
+            _set(message, field, kind=kind, value=value, lengths=lengths)
         except (TypeError, ValueError) as error:
             raise RecordingError(f"{name}.{field} cannot be recorded: {error}") from None
 
 
-def _set(message: Any, field: str, kind: Kind, value: Any, lengths: dict[str, int]) -> None:
+def _set(message: Any, field: str, *, kind: Kind, value: Any, lengths: dict[str, int]) -> None:
     if kind.dtype is not None:
-        _set_array(getattr(message, field), kind, np.asarray(value), lengths)
+        _set_array(getattr(message, field), kind, value=np.asarray(value), lengths=lengths)
     elif kind.is_mapping:
         for key, item in value.items():
             getattr(message, field).add(name=key, value=item)
     elif kind.is_message:
         getattr(message, field).SetInParent()
-        _fill(getattr(message, field), kind.type, value)
+        _fill(getattr(message, field), kind.type, values=value)
     elif kind.repeated:
         getattr(message, field).extend(value)
     else:
         setattr(message, field, value)
 
 
-def _set_array(target: Any, kind: Kind, value: np.ndarray, lengths: dict[str, int]) -> None:
-    _check_array(kind, value.dtype, value.shape, lengths)
+def _set_array(target: Any, kind: Kind, *, value: np.ndarray, lengths: dict[str, int]) -> None:
+    _check_array(kind, value.dtype, shape=value.shape, lengths=lengths)
     stored = value.astype(kind.dtype, copy=False)
     if kind.narrow:
         with np.errstate(over="ignore"):
@@ -195,12 +195,12 @@ def _set_array(target: Any, kind: Kind, value: np.ndarray, lengths: dict[str, in
 def _values(message: Any, name: str) -> dict[str, Any]:
     lengths: dict[str, int] = {}
     return {
-        field: _get(message, f"{name}.{field}", field, kind, lengths)
+        field: _get(message, f"{name}.{field}", field=field, kind=kind, lengths=lengths)
         for field, kind in field_kinds(name).items()
     }
 
 
-def _get(message: Any, where: str, field: str, kind: Kind, lengths: dict[str, int]) -> Any:
+def _get(message: Any, where: str, *, field: str, kind: Kind, lengths: dict[str, int]) -> Any:
     value = getattr(message, field)
     if kind.is_mapping:
         return {item.name: item.value for item in value}
@@ -212,10 +212,14 @@ def _get(message: Any, where: str, field: str, kind: Kind, lengths: dict[str, in
         if kind.optional:
             return None
         raise RecordingError(f"{where} is missing")
-    return _values(value, kind.type) if kind.dtype is None else _array(where, kind, value, lengths)
+    return (
+        _values(value, kind.type)
+        if kind.dtype is None
+        else _array(where, kind, message=value, lengths=lengths)
+    )
 
 
-def _array(where: str, kind: Kind, message: Any, lengths: dict[str, int]) -> np.ndarray:
+def _array(where: str, kind: Kind, *, message: Any, lengths: dict[str, int]) -> np.ndarray:
     """Return the array of an Array message, in the machine's byte order; read-only."""
     wide, data = kind.dtype, message.data
     assert wide is not None
@@ -224,7 +228,7 @@ def _array(where: str, kind: Kind, message: Any, lengths: dict[str, int]) -> np.
     if message.dtype != dtype.str:
         raise RecordingError(f"{where} is of type {message.dtype!r}; accepted: {dtype.str!r}")
     try:
-        _check_array(kind, wide, shape, lengths)
+        _check_array(kind, wide, shape=shape, lengths=lengths)
     except ValueError as error:
         raise RecordingError(f"{where}: {error}") from None
     if max(shape) > _LONGEST or len(data) != math.prod(shape) * dtype.itemsize:
@@ -238,7 +242,7 @@ def _array(where: str, kind: Kind, message: Any, lengths: dict[str, int]) -> np.
 
 
 def _check_array(
-    kind: Kind, dtype: np.dtype[Any], shape: tuple[int, ...], lengths: dict[str, int]
+    kind: Kind, dtype: np.dtype[Any], *, shape: tuple[int, ...], lengths: dict[str, int]
 ) -> None:
     """Raise ValueError unless type and shape are right; keeps the lengths of letters."""
     assert kind.dtype is not None
@@ -269,7 +273,8 @@ def _file(name: str) -> descriptor_pb2.FileDescriptorProto:
         proto = file.message_type[0].field.add(name=field, number=number)
         proto.label = proto.LABEL_REPEATED if kind.repeated else proto.LABEL_OPTIONAL
         if kind.is_message:
-            proto.type, proto.type_name = proto.TYPE_MESSAGE, f".{PACKAGE}.{kind.type}"
+            proto.type = proto.TYPE_MESSAGE
+            proto.type_name = f".{PACKAGE}.{kind.type}"
             if _path(kind.type) not in file.dependency:
                 file.dependency.append(_path(kind.type))
         else:

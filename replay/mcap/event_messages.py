@@ -114,7 +114,7 @@ def _session_values(event: SessionStarted) -> dict[str, Any]:
 
 
 def session_from(
-    values: Mapping[str, Any], points: KnownPoints, mesh: trimesh.Trimesh, sdf: SdfGrid
+    values: Mapping[str, Any], points: KnownPoints, *, mesh: trimesh.Trimesh, sdf: SdfGrid
 ) -> SessionStarted:
     """Return the start of a session, with its points and attachments."""
     parts = {
@@ -200,8 +200,10 @@ class RecordedProblem:
             "pushes": None if values["pushes"] is None else Pushes(**values["pushes"]),
         }
         problem = RegistrationProblem(**shared_arguments(RegistrationProblem, values) | parts)
-        check_digest(f"the problem of step {self.step}", problem.digest, values["digest"])
-        check_digest(f"all points of step {self.step}", points.digest, values["points_digest"])
+        check_digest(f"the problem of step {self.step}", problem.digest, recorded=values["digest"])
+        check_digest(
+            f"all points of step {self.step}", points.digest, recorded=values["points_digest"]
+        )
         return problem
 
 
@@ -213,7 +215,7 @@ def archive_values(step: int, archive: ArchiveSnapshot) -> dict[str, Any]:
 def archive_from(values: Mapping[str, Any]) -> ArchiveSnapshot:
     """Return the archive in a message; raise RecordingError unless it has its digest."""
     archive = ArchiveSnapshot(**shared_arguments(ArchiveSnapshot, values))
-    check_digest(f"an archive of step {values['step']}", archive.digest, values["digest"])
+    check_digest(f"an archive of step {values['step']}", archive.digest, recorded=values["digest"])
     return archive
 
 
@@ -232,7 +234,8 @@ def _rig_from(values: Mapping[str, Any]) -> RigDescribed:
 
     hand = None
     if values["hand_vertices"] is not None:
-        vertices, faces = values["hand_vertices"].copy(), values["hand_faces"].astype(np.int64)
+        vertices = values["hand_vertices"].copy()
+        faces = values["hand_faces"].astype(np.int64)
         hand = trimesh.Trimesh(vertices, faces, process=False)
     return RigDescribed(**shared_arguments(RigDescribed, values), hand=hand)
 
@@ -308,8 +311,8 @@ def _offered_from(values: Mapping[str, Any]) -> ActionsOffered:
     """Return the actions in a message; raise RecordingError unless they have their digest."""
     actions = Actions(**shared_arguments(Actions, values))
     hand = HandShape(values["hand_vertices"], values["hand_faces"])
-    event = ActionsOffered(values["step"], actions, hand)
-    check_digest("the actions offered", _digest_of(event), values["digest"])
+    event = ActionsOffered(values["step"], actions, hand=hand)
+    check_digest("the actions offered", _digest_of(event), recorded=values["digest"])
     return event
 
 
@@ -349,7 +352,7 @@ class RecordedDecision:
         return int(self.values["step"])
 
     def completed(
-        self, start: SessionStarted, offered: ActionsOffered, points: KnownPoints
+        self, start: SessionStarted, offered: ActionsOffered, *, points: KnownPoints
     ) -> Decided:
         """Return it with its whole problem; raise RecordingError unless that was recorded."""
         values = self.values
@@ -366,14 +369,16 @@ class RecordedDecision:
             verdict=values["verdict"],
         )
         what = f"the problem of the decision of step {self.step}"
-        check_digest(what, problem.digest, values["problem_digest"])
-        return Decided(self.step, problem, self.decision, values["surprise"])
+        check_digest(what, problem.digest, recorded=values["problem_digest"])
+        return Decided(self.step, problem, decision=self.decision, surprise=values["surprise"])
 
 
 def decision_from(values: Mapping[str, Any]) -> RecordedDecision:
     """Return the decision in a message; raise RecordingError unless it has its digest."""
     decision = Decision(**shared_arguments(Decision, values))
-    check_digest(f"the decision of step {values['step']}", decision.digest, values["digest"])
+    check_digest(
+        f"the decision of step {values['step']}", decision.digest, recorded=values["digest"]
+    )
     return RecordedDecision(values, decision)
 
 

@@ -58,7 +58,7 @@ class EventReader:
         step = message.log_time // STEP_TIME - 1
         entry: Entry
         if topic in CLOUDS:
-            _check_step(topic, self._opening.get("step", BEFORE_ALL_STEPS), step)
+            _check_step(topic, self._opening.get("step", BEFORE_ALL_STEPS), timed=step)
             self._clouds[topic] = cloud_points(data, CLOUDS[topic])
             return None
         if topic == "/log":
@@ -67,7 +67,7 @@ class EventReader:
             if topic == "/session":
                 _check_version(data)
             values = decode(RECORDS[topic], data)
-            _check_step(topic, values.get("step", step), step)
+            _check_step(topic, values.get("step", step), timed=step)
             check_message(RECORDS[topic], values)
             if topic in ("/session", "/probe"):
                 self.within, self._opening = topic, values
@@ -78,7 +78,9 @@ class EventReader:
 
     def skip(self) -> None:
         """Drop the event that missing messages belong to."""
-        self.within, self._opening, self._counts = None, {}, None
+        self.within = None
+        self._opening = {}
+        self._counts = None
         self._clouds.clear()
         self._last_snapshot = None
 
@@ -115,14 +117,16 @@ class EventReader:
             for topic, columns in CLOUDS.items()
         }
         free, occupied, known = clouds.values()
-        points = KnownPoints(free, occupied, known[:, :3], known[:, 3])
+        points = KnownPoints(free, occupied, known=known[:, :3], known_sdf=known[:, 3])
         counts = {name: len(getattr(points, name)) for name in POINT_CLASSES}
         before = self._counts or {name: values[name] - counts[name] for name in counts}
         self._counts = {name: before[name] + count for name, count in counts.items()}
         for name, count in counts.items():
             if (count, self._counts[name]) != (values[f"new_{name}"], values[name]):
                 raise RecordingError(f"{name} points of step {values['step']} are missing")
-        check_digest(f"new points of step {values['step']}", points.digest, values["new_digest"])
+        check_digest(
+            f"new points of step {values['step']}", points.digest, recorded=values["new_digest"]
+        )
         if values["step"] != self._opening.get("step", BEFORE_ALL_STEPS):
             raise RecordingError(f"the points of step {values['step']} follow another probe")
         topic, self.within = self.within, None
@@ -131,7 +135,7 @@ class EventReader:
             self._sdf_digest = self._opening["sdf_digest"]
             mesh = mesh_attached(self._attachments, self._opening["mesh_digest"])
             sdf = sdf_attached(self._attachments, self._sdf_digest)
-            return session_from(self._opening, points, mesh, sdf)
+            return session_from(self._opening, points, mesh=mesh, sdf=sdf)
         return Probe(**shared_arguments(Probe, self._opening), new_points=points)
 
     def _problem(self, values: dict[str, Any]) -> RecordedProblem:
@@ -141,7 +145,7 @@ class EventReader:
                 raise RecordingError(f"the low-cost set of step {step} is missing")
             values["low_cost_set"] = self._last_elites
         grid = f"the SDF grid of the problem of step {step}"
-        check_digest(grid, self._sdf_digest, values["sdf_digest"])
+        check_digest(grid, self._sdf_digest, recorded=values["sdf_digest"])
         return RecordedProblem(values)
 
     def _hypotheses(self, values: dict[str, Any]) -> HypothesesFound:
@@ -154,12 +158,12 @@ class EventReader:
                 raise RecordingError(f"the archive of step {step} is missing")
             check_cells(values["cell"], archive.shape)
         found = Hypotheses(**shared_arguments(Hypotheses, values | {"archive": archive}))
-        check_digest(f"the hypotheses of step {step}", found.digest, values["digest"])
+        check_digest(f"the hypotheses of step {step}", found.digest, recorded=values["digest"])
         self._last_elites = found.elites
         return HypothesesFound(step, found)
 
 
-def _check_step(topic: str, step: int, timed: int) -> None:
+def _check_step(topic: str, step: int, *, timed: int) -> None:
     if step != timed:
         raise RecordingError(f"a message on {topic} has a time of step {timed}, not its own")
 

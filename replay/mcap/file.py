@@ -64,7 +64,7 @@ def file_records(file: IO[bytes], size: int) -> Iterator[McapRecord]:
     yield from reader.records
 
 
-def chunk_at(file: IO[bytes], size: int, place: int) -> Chunk:
+def chunk_at(file: IO[bytes], size: int, *, place: int) -> Chunk:
     """Return the chunk at a place; raise one of MALFORMED if there is none."""
     file.seek(place)
     reader = StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=size)
@@ -184,7 +184,7 @@ class McapFile:
                 count += 1
                 topic = self._topics.get(record.channel_id, "")
                 if topic in self._names:
-                    found.append(StoredMessage(topic, record.log_time, record.data))
+                    found.append(StoredMessage(topic, record.log_time, data=record.data))
         self.count = count
         return found
 
@@ -223,7 +223,7 @@ class McapFile:
 @contextmanager
 def opened(path: Path) -> Iterator[IO[bytes]]:
     """Open a recording for reading; raise RecordingError where that fails, also later on."""
-    refuse_special_file(f"recording {path}", path, RecordingError)
+    refuse_special_file(f"recording {path}", path, error=RecordingError)
     try:
         with path.open("rb") as file:
             yield file

@@ -97,7 +97,7 @@ def cloud_points(data: bytes, columns: int) -> FloatArray:
     return np.frombuffer(message.data, "<f8").astype(np.float64, copy=False).reshape(-1, columns)
 
 
-def log_line(level: str, text: str, time: int) -> bytes:
+def log_line(level: str, text: str, time: int) -> bytes:  # noqa: PLR0917
     """Return a line of text of level "info" or "warning"."""
     if level not in _LEVELS:
         raise RecordingError(f"log level is {level!r}; accepted: {', '.join(_LEVELS)}")

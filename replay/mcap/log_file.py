@@ -73,7 +73,7 @@ class RawFile:
         self.times: tuple[int, int] | None = None  # first and last log time, nanoseconds
         self._schemas: dict[int, records.Schema] = {}
         self._chunks: list[ChunkIndex] = []
-        refuse_special_file(f"log {path}", path, SessionError)
+        refuse_special_file(f"log {path}", path, error=SessionError)
         try:
             with path.open("rb") as file:
                 start = file.read(len(MCAP0_MAGIC))
@@ -96,6 +96,7 @@ class RawFile:
         self,
         topics: frozenset[str] | None,
         fault: Fault,
+        *,
         progress: Callable[[int], None] = lambda done: None,
     ) -> Iterator[RawMessage]:
         """Yield the messages on topics (None: all). fault and progress: called with damage, bytes.
@@ -105,7 +106,7 @@ class RawFile:
         try:
             with self.path.open("rb") as file:
                 if self.is_indexed:
-                    yield from self._by_time(file, topics, fault, progress)
+                    yield from self._by_time(file, topics, fault=fault, progress=progress)
                     return
                 try:
                     for record in file_records(file, self.size):
@@ -113,7 +114,7 @@ class RawFile:
                             return
                         progress(file.tell())
                         inside = unpacked(record) if isinstance(record, Chunk) else [record]
-                        yield from self._messages(inside, topics, fault)
+                        yield from self._messages(inside, topics, fault=fault)
                 except MALFORMED as error:
                     fault(f"{self.path.name}: {reason_of(error)}")
         except OSError as error:
@@ -123,6 +124,7 @@ class RawFile:
         self,
         file: IO[bytes],
         topics: frozenset[str] | None,
+        *,
         fault: Fault,
         progress: Callable[[int], None],
     ) -> Iterator[RawMessage]:
@@ -135,11 +137,11 @@ class RawFile:
             channels = [self.channels.get(number) for number in chunk.message_index_offsets]
             if not channels or any(_is_wanted(channel, topics) for channel in channels):
                 try:
-                    inside = unpacked(chunk_at(file, self.size, chunk.chunk_start_offset))
+                    inside = unpacked(chunk_at(file, self.size, place=chunk.chunk_start_offset))
                 except MALFORMED as error:
                     fault(f"{self.path.name}: {reason_of(error)}")
                     inside = []
-                for number, message in enumerate(self._messages(inside, topics, fault)):
+                for number, message in enumerate(self._messages(inside, topics, fault=fault)):
                     place = (message.log_time, chunk.chunk_start_offset, number)
                     heapq.heappush(waiting, (*place, message))
             done += chunk.chunk_length
@@ -148,7 +150,7 @@ class RawFile:
             yield heapq.heappop(waiting)[3]
 
     def _messages(
-        self, inside: list[McapRecord], topics: frozenset[str] | None, fault: Fault
+        self, inside: list[McapRecord], topics: frozenset[str] | None, *, fault: Fault
     ) -> Iterator[RawMessage]:
         for record in inside:
             self._describe(record)
@@ -160,7 +162,7 @@ class RawFile:
             elif record.log_time >= _END_OF_TIME:
                 fault(f"{channel.topic}: a message at a time beyond the end of time")
             elif _is_wanted(channel, topics):
-                yield RawMessage(channel, record.log_time, record.data)
+                yield RawMessage(channel, record.log_time, data=record.data)
 
     def _read_index(self, file: IO[bytes]) -> bool:
         """Look at the end of the file; whether there is an index of all chunks."""
@@ -197,7 +199,7 @@ class RawFile:
                 text = schema.data.decode("utf-8", "replace")
             name = "" if schema is None else one_line(schema.name)
             topic, encoding = one_line(record.topic), one_line(record.message_encoding)
-            self.channels[record.id] = Channel(topic, encoding, name, text)
+            self.channels[record.id] = Channel(topic, encoding, schema=name, definition=text)
 
 
 def _is_wanted(channel: Channel | None, topics: frozenset[str] | None) -> bool:

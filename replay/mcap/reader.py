@@ -41,7 +41,12 @@ class Recording:
     """A session, as its recording has it."""
 
     def __init__(
-        self, path: Path, entries: list[Entry], damage: str | None, attachments: Mapping[str, int]
+        self,
+        path: Path,
+        entries: list[Entry],
+        *,
+        damage: str | None,
+        attachments: Mapping[str, int],
     ) -> None:
         if not entries or not isinstance(entries[0], SessionStarted):
             why = "" if damage is None else f": it is {damage}"
@@ -71,7 +76,8 @@ class Recording:
         Images are read from the file once more, one at a time, or left out.
         """
         points = self.start.initial_points
-        seen, offered = self._images(), self.offered
+        seen = self._images()
+        offered = self.offered
         for entry in self._entries:
             if isinstance(entry, Probe):
                 points = points.merged(entry.new_points)
@@ -80,7 +86,7 @@ class Recording:
             if isinstance(entry, RecordedProblem):
                 yield ProblemPosed(entry.step, self._completed(entry, points))
             elif isinstance(entry, RecordedDecision):
-                yield self._decided(entry, offered, points)
+                yield self._decided(entry, offered, points=points)
             elif not isinstance(entry, ImagePlace):
                 yield entry
             elif images:
@@ -95,36 +101,37 @@ class Recording:
     def sensor_images(self, steps: Sequence[int] | None = None) -> Iterator[SensorImage]:
         """Yield the images of some steps (None: of all) in their order, read one at a time."""
         for step in steps or ():
-            self._check_step(step, self.image_steps, "image of a sensor")
+            self._check_step(step, self.image_steps, what="image of a sensor")
         return self._images(steps)
 
     def problem(self, step: int) -> RegistrationProblem:
         """Return the registration problem of a step, from the file alone; its digest is checked."""
-        self._check_step(step, self.steps, "registration problem")
+        self._check_step(step, self.steps, what="registration problem")
         entry, points = self._found(RecordedProblem, step)
         return self._completed(entry, points)
 
     def decision(self, step: int) -> Decided:
         """Return the decision that follows a step, with its problem, whose digest is checked."""
-        self._check_step(step, self.decision_steps, "decision")
+        self._check_step(step, self.decision_steps, what="decision")
         entry, points = self._found(RecordedDecision, step)
         before = self._entries[: self._entries.index(entry)]
         offered = [each for each in before if isinstance(each, ActionsOffered)]
-        return self._decided(entry, offered[-1], points)
+        return self._decided(entry, offered[-1], points=points)
 
     def checked_steps(self, steps: Sequence[int] | None) -> tuple[int, ...]:
         """Return steps with a problem, in order; None: all. Raise RecordingError for others."""
         if steps is None:
             return self.steps
-        wanted, known = set(steps), set(self.steps)
+        wanted = set(steps)
+        known = set(self.steps)
         for step in sorted(wanted - known):
-            self._check_step(step, self.steps, "registration problem")
+            self._check_step(step, self.steps, what="registration problem")
         return tuple(step for step in self.steps if step in wanted)
 
     def hypotheses(self, step: int) -> Hypotheses:
         """Return the hypotheses of the registration of a step."""
         if step not in self._results:
-            self._check_step(step, tuple(self._results), "result")
+            self._check_step(step, tuple(self._results), what="result")
         return self._results[step]
 
     def has_result(self, step: int) -> bool:
@@ -190,17 +197,17 @@ class Recording:
         return entry, points
 
     def _decided(
-        self, entry: RecordedDecision, offered: ActionsOffered | None, points: KnownPoints
+        self, entry: RecordedDecision, offered: ActionsOffered | None, *, points: KnownPoints
     ) -> Decided:
         assert offered is not None  # as the decision was read
         with _blaming(self.path):
-            return entry.completed(self.start, offered, points)
+            return entry.completed(self.start, offered, points=points)
 
     def _completed(self, entry: RecordedProblem, points: KnownPoints) -> RegistrationProblem:
         with _blaming(self.path):
             return entry.completed(self.start.sdf, points)
 
-    def _check_step(self, step: int, accepted: tuple[int, ...], what: str) -> None:
+    def _check_step(self, step: int, accepted: tuple[int, ...], *, what: str) -> None:
         if step not in accepted:
             steps = ", ".join(map(str, accepted)) or "none"
             raise RecordingError(
@@ -217,7 +224,8 @@ def read_recording(path: str | Path, *, partial: bool = False) -> Recording:
     """
     path = Path(path).expanduser()
     file = McapFile(path, TOPIC_SCHEMAS, partial=partial)
-    reader, entries = EventReader(file.attachments), list[Entry]()
+    reader = EventReader(file.attachments)
+    entries = list[Entry]()
     for message in file.messages():
         with _blaming(path):
             entry = reader.take(message)
@@ -226,7 +234,7 @@ def read_recording(path: str | Path, *, partial: bool = False) -> Recording:
     if reader.within is not None and file.damage is None:
         raise DamagedRecordingError(path, f"ends within an event on {reader.within}")
     sizes = {name: len(data) for name, data in file.attachments.items()}
-    return Recording(path, entries, file.damage, sizes)
+    return Recording(path, entries, damage=file.damage, attachments=sizes)
 
 
 @contextmanager

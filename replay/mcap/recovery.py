@@ -87,7 +87,8 @@ def recover(path: Path, out: Path) -> Recovered:
     """
     recovery = _Recovery(path)
     with new_file(out) as beside:
-        recorder, flushed = McapRecorder(beside), BEFORE_ALL_STEPS
+        recorder = McapRecorder(beside)
+        flushed = BEFORE_ALL_STEPS
         try:
             for event in recovery.events():
                 if isinstance(event, Probe | SensorImage) and event.step > flushed:
@@ -154,7 +155,7 @@ class _Recovery:
                 if begin < file.place:
                     continue
                 try:
-                    messages, missing = file.later_messages(chunk_at(stream, size, begin))
+                    messages, missing = file.later_messages(chunk_at(stream, size, place=begin))
                 except MALFORMED as error:
                     yield f"bytes {begin} to {begin + chunk.chunk_length}", reason_of(error)
                     continue
@@ -164,7 +165,8 @@ class _Recovery:
 
     def _taken(self, message: StoredMessage) -> Iterator[Event]:
         """Yield the event that a message completes, if it still makes sense where it is."""
-        topic, step = message.topic, message.log_time // STEP_TIME - 1
+        topic = message.topic
+        step = message.log_time // STEP_TIME - 1
         if topic == "/session":
             message = self._with_grid(message)
         try:
@@ -197,12 +199,13 @@ class _Recovery:
             return ProblemPosed(entry.step, entry.completed(self._start.sdf, points))
         if self._offered is None:
             raise RecordingError("the actions offered were lost before")
-        return entry.completed(self._start, self._offered, points)
+        return entry.completed(self._start, self._offered, points=points)
 
     def _note(self, event: Event) -> None:
         match event:
             case SessionStarted():
-                self._start, self._points = event, event.initial_points
+                self._start = event
+                self._points = event.initial_points
             case ActionsOffered():
                 self._offered = event
             case Probe():
@@ -222,7 +225,7 @@ class _Recovery:
         if what not in self.found.lost:
             self.found.lost[what] = reason
             if self._start is not None and not self.found.ended:
-                yield Logged(self._order.step, "warning", f"{RECOVERED}lost: {what}: {reason}")
+                yield Logged(self._order.step, "warning", text=f"{RECOVERED}lost: {what}: {reason}")
 
     def _with_grid(self, message: StoredMessage) -> StoredMessage:
         """Return the session's message; a damaged SDF grid is made again as far as that can be.
@@ -239,7 +242,7 @@ class _Recovery:
         with suppress(*_WRONG, LookupError, TypeError):
             mesh = mesh_attached(attachments, values["mesh_digest"])
             stand_in = None
-            for grid in _grids(mesh, values["config"], attachments):
+            for grid in _grids(mesh, values["config"], attachments=attachments):
                 stand_in = stand_in or grid
                 self.found.remade = grid.digest == values["sdf_digest"]
                 if self.found.remade:
@@ -260,7 +263,7 @@ class _Recovery:
 
 
 def _grids(
-    mesh: trimesh.Trimesh, config: str, attachments: Mapping[str, bytes]
+    mesh: trimesh.Trimesh, config: str, *, attachments: Mapping[str, bytes]
 ) -> Iterator[SdfGrid]:
     """Yield grids that the session may have had: configured, default, as the damaged one begins."""
     ways: list[tuple[float | None, float]] = [(None, OBJECT_PADDING)]

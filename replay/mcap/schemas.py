@@ -151,7 +151,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "archive": "ArchiveSnapshot?",
         "archive_is_last_snapshot": "bool",  # then `archive` is absent
         "digest": "string",
-        "push_distance": ("double", between(0.0, 1.0, "m")),
+        "push_distance": ("double", between(0.0, 1.0, unit="m")),
     },
     "Measured": {"step": "sint32", "values": ("Number*", short_names)},
     "Timed": {"step": "sint32", "seconds": ("Number*", short_names, finite)},
@@ -168,10 +168,10 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "step": "sint32",
         "sensor": ("string", sensor_name),
         "kind": ("string", one_of("depth", "deformation")),
-        "height": ("uint32", between(1, LARGEST_SIDE, "pixels")),
-        "width": ("uint32", between(1, LARGEST_SIDE, "pixels")),
+        "height": ("uint32", between(1, LARGEST_SIDE, unit="pixels")),
+        "width": ("uint32", between(1, LARGEST_SIDE, unit="pixels")),
         "values": "bytes",  # 16 bits a pixel, little-endian
-        "unit": ("double", between(1e-9, 1e3, "m")),
+        "unit": ("double", between(1e-9, 1e3, unit="m")),
         "mask": "bytes",  # a bit a pixel, the first the highest of a byte
         "intrinsics": ("f8[4]", intrinsics),  # fx, fy, cx, cy, pixels
         "world_from_camera": ("f8[4,4]", rigid),
@@ -196,7 +196,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "problem_digest": "string",
         "chosen": "sint32",
         "stop": ("string", stop_reason),
-        "spread": ("double", between(0.0, 1e6, "m")),
+        "spread": ("double", between(0.0, 1e6, unit="m")),
         "score": "f8[A]",
         "hit_chance": ("f8[A]", chances),
         "blocked_chance": ("f8[A]", chances),
@@ -213,7 +213,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "object_from_world": ("f8[M,4,4]", rigid),
         "centres": ("f8[M,3]", finite),
         "covariances": ("f8[M,6,6]", finite),
-        "spread": ("double", between(0.0, 1e6, "m")),
+        "spread": ("double", between(0.0, 1e6, unit="m")),
     },
     # No topic: this is the attachment "sdf_grid".
     "SdfGrid": {

@@ -11,7 +11,7 @@ LONGEST = 2**20
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
-def check_text(what: str, text: str, longest: int = LONGEST) -> None:
+def check_text(what: str, text: str, *, longest: int = LONGEST) -> None:
     """Raise RecordingError for control characters but tab and newline, and for what is too long."""
     if len(text) > longest:
         raise RecordingError(f"{what} has {len(text)} characters; accepted: at most {longest}")
@@ -31,6 +31,6 @@ def one_line(text: str) -> str:
 
 def check_name(what: str, text: str) -> None:
     """Raise RecordingError unless a text is a short name on one line."""
-    check_text(what, text, LONGEST_NAME)
+    check_text(what, text, longest=LONGEST_NAME)
     if "\n" in text:
         raise RecordingError(f"{what} is {text!r}; accepted: a name on one line")

@@ -38,7 +38,7 @@ def one_of(*accepted: str) -> Check:
     return check
 
 
-def between(low: float, high: float, unit: str) -> Check:
+def between(low: float, high: float, *, unit: str) -> Check:
     """Return the check of a number from `low` to `high`, in a unit."""
 
     def check(field: str, value: float) -> None:
@@ -137,7 +137,7 @@ def voxel_side(field: str, value: float) -> None:
     """Accept a side of voxels that a problem can have, metres."""
     from chsel.problem.sdf_grid import COARSEST, FINEST
 
-    between(FINEST, COARSEST, "m")(field, value)
+    between(FINEST, COARSEST, unit="m")(field, value)
 
 
 def intrinsics(field: str, value: np.ndarray) -> None:
@@ -182,7 +182,9 @@ def check_decision(made: Mapping[str, Any]) -> None:
     """Raise RecordingError unless choice, scores and contacts of a message `Decision` agree."""
     from chsel.next_probe.forecast import MOST_POSES
 
-    chosen, score, contacts = made["chosen"], made["score"], made["contacts"]
+    chosen = made["chosen"]
+    score = made["score"]
+    contacts = made["contacts"]
     if len(made["weights"]) > MOST_POSES:
         raise RecordingError(f"it has {len(made['weights'])} poses; accepted: at most {MOST_POSES}")
     if not -1 <= chosen < len(score):
@@ -226,7 +228,9 @@ def check_hypotheses(found: Mapping[str, Any]) -> None:
     Poses that are not finite are those of a descent that diverged: their cost is not finite. Cells
     are not checked while the message leaves out the archive, as it repeats the last snapshot.
     """
-    poses, cost, cell = found["object_from_world"], found["cost"], found["cell"]
+    poses = found["object_from_world"]
+    cost = found["cost"]
+    cell = found["cell"]
     diverged = ~np.isfinite(poses).all(axis=(1, 2))
     if (np.isfinite(cost) & diverged).any():
         raise RecordingError(
@@ -246,7 +250,7 @@ def check_cells(cell: np.ndarray, shape: tuple[int, ...]) -> None:
         raise RecordingError(f"cell is out of range; accepted: -1 to {cells - 1}")
 
 
-def check_digest(what: str, digest: str, recorded: str) -> None:
+def check_digest(what: str, digest: str, *, recorded: str) -> None:
     """Raise RecordingError unless a digest is the recorded one."""
     if digest != recorded:
         raise RecordingError(f"{what} has digest {digest}, not {recorded} as recorded")

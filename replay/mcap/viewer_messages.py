@@ -127,30 +127,31 @@ class SceneMessages:
     def object_mesh(self, time: int) -> bytes:
         """Return the object where the frame "object" is."""
         color = (*OBJECT_COLOR, _OBJECT_OPACITY)
-        return self._scene("object", _OBJECT, np.eye(4)[None], [color], time)
+        return self._scene("object", _OBJECT, poses=np.eye(4)[None], colors=[color], time=time)
 
     def object_surface(self, time: int) -> bytes:
         """Return vertices of the object where the frame "object" is."""
         color = np.array(OBJECT_COLOR, np.uint8)
-        return colored_cloud(self._vertices, color, time, frame=_OBJECT)
+        return colored_cloud(self._vertices, color, time=time, frame=_OBJECT)
 
-    def hypothesis_meshes(self, poses: FloatArray, colors: ColorArray, time: int) -> bytes:
+    def hypothesis_meshes(self, poses: FloatArray, colors: ColorArray, time: int) -> bytes:  # noqa: PLR0917
         """Return the object at each hypothesis (D, 4, 4), in its color (D, 3), the best bright."""
         opacities = [_BEST_OPACITY, *[_OTHER_OPACITY] * len(poses)]
         shown = [(*color, a) for color, a in zip(colors.tolist(), opacities, strict=False)]
-        return self._scene("hypotheses", WORLD, poses, shown, time)
+        return self._scene("hypotheses", WORLD, poses=poses, colors=shown, time=time)
 
-    def hypothesis_surfaces(self, poses: FloatArray, colors: ColorArray, time: int) -> bytes:
+    def hypothesis_surfaces(self, poses: FloatArray, colors: ColorArray, time: int) -> bytes:  # noqa: PLR0917
         """Return points of the surface of the object at each hypothesis."""
         points = self._surface @ poses[:, :3, :3].swapaxes(-1, -2) + poses[:, None, :3, 3]
         return colored_cloud(
-            points.reshape(-1, 3), np.repeat(colors, len(self._surface), axis=0), time
+            points.reshape(-1, 3), np.repeat(colors, len(self._surface), axis=0), time=time
         )
 
     def _scene(
         self,
         name: str,
         frame: str,
+        *,
         poses: FloatArray,
         colors: list[tuple[float, ...]],
         time: int,
@@ -254,7 +255,7 @@ def object_in_world(world_from_object: FloatArray, time: int) -> bytes:
     return serialized(transform)
 
 
-def colored_cloud(points: FloatArray, color: ColorArray, time: int, frame: str = WORLD) -> bytes:
+def colored_cloud(points: FloatArray, color: ColorArray, time: int, frame: str = WORLD) -> bytes:  # noqa: PLR0917
     """Return points (N, 3), rounded to float32, in one color (3,) or a color each (N, 3)."""
     data = np.zeros(len(points), _POINT)
     with np.errstate(over="ignore"):
@@ -277,7 +278,7 @@ def colored_cloud(points: FloatArray, color: ColorArray, time: int, frame: str =
 
 def empty_cloud(time: int) -> bytes:
     """Return a cloud of no points."""
-    return colored_cloud(np.zeros((0, 3)), np.zeros(3, np.uint8), time)
+    return colored_cloud(np.zeros((0, 3)), np.zeros(3, np.uint8), time=time)
 
 
 def _poses(poses: FloatArray) -> list[Pose]:
@@ -304,13 +305,13 @@ def simple_mesh(mesh: trimesh.Trimesh, most: int = _MOST_FACES) -> tuple[FloatAr
     vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
     cells = _FINEST
     while len(faces) > most and cells >= _COARSEST:
-        vertices, faces = _joined(vertices, faces, cells)
+        vertices, faces = _joined(vertices, faces, cells=cells)
         cells -= 1
     used, faces = np.unique(faces[:most], return_inverse=True)
     return vertices[used], faces.reshape(-1, 3)
 
 
-def _joined(vertices: FloatArray, faces: IntArray, cells: int) -> tuple[FloatArray, IntArray]:
+def _joined(vertices: FloatArray, faces: IntArray, *, cells: int) -> tuple[FloatArray, IntArray]:
     """Return the vertices of each cell as one, their mean; without the faces that vanish."""
     lower, upper = vertices.min(axis=0), vertices.max(axis=0)
     side = max(float((upper - lower).max()) / cells, np.finfo(np.float64).tiny)

@@ -85,7 +85,7 @@ class McapRecorder(Recorder):
         """Raise RecordingError for values that `record` refuses."""
         match event:
             case Logged():
-                log_line(event.level, event.text, 0)
+                log_line(event.level, event.text, time=0)
             case HypothesesFound():
                 check_message(RECORDS[event.topic], self._hypotheses_values(event))
             case _:
@@ -103,7 +103,7 @@ class McapRecorder(Recorder):
             self._order.take(event.topic, event.step)
             self._write(event)
             for topic, make in self._views.after(event):
-                self._add(topic, event.step, make)
+                self._add(topic, event.step, make=make)
             if isinstance(event, SessionStarted | RigDescribed | ActionsOffered):
                 self._writer.flush()  # so that it is read, or lost, apart from what follows
 
@@ -134,24 +134,24 @@ class McapRecorder(Recorder):
             case SessionStarted():
                 self._write_session(event)
             case Probe():
-                self._record(event.topic, event.step, event_values(event))
+                self._record(event.topic, event.step, values=event_values(event))
                 self._write_points(event.step, event.new_points)
             case ProblemPosed():
                 self._write_problem(event)
             case ActionsOffered():
-                self._record(event.topic, event.step, event_values(event))
+                self._record(event.topic, event.step, values=event_values(event))
                 self._offered = event
             case Decided():
                 self._write_decision(event)
             case SnapshotTaken():
-                self._record(event.topic, event.step, event_values(event))
+                self._record(event.topic, event.step, values=event_values(event))
                 self._last_snapshot = event
             case HypothesesFound():
                 self._write_hypotheses(event)
             case Logged():
-                self._add(event.topic, event.step, partial(log_line, event.level, event.text))
+                self._add(event.topic, event.step, make=partial(log_line, event.level, event.text))
             case _:
-                self._record(event.topic, event.step, event_values(event))
+                self._record(event.topic, event.step, values=event_values(event))
 
     def _write_session(self, event: SessionStarted) -> None:
         values = event_values(event)
@@ -160,9 +160,9 @@ class McapRecorder(Recorder):
         for name, data in ((MESH, mesh_to_ply(event.mesh)), (SDF_GRID, sdf_to_bytes(event.sdf))):
             self._writer.add_attachment(0, 0, name, MEDIA_TYPES[name], data)
         self._start = event
-        self._record(event.topic, event.step, values)
+        self._record(event.topic, event.step, values=values)
         for topic in STARTING_EMPTY:
-            self._add(topic, event.step, empty_cloud)
+            self._add(topic, event.step, make=empty_cloud)
         self._points = KnownPoints()
         self._write_points(event.step, event.initial_points)
 
@@ -172,12 +172,12 @@ class McapRecorder(Recorder):
         known = np.column_stack([new.known, new.sdf])
         for topic, points in zip(CLOUDS, (new.free, new.occupied, known), strict=True):
             if len(points) > 0:
-                self._add(topic, step, partial(point_cloud, points))
+                self._add(topic, step, make=partial(point_cloud, points))
         self._points = self._points.merged(new)
         values: dict[str, Any] = {name: len(getattr(self._points, name)) for name in POINT_CLASSES}
         values |= {f"new_{name}": len(getattr(new, name)) for name in POINT_CLASSES}
         values |= {"step": step, "new_digest": new.digest}
-        self._record("/known_points", step, values)
+        self._record("/known_points", step, values=values)
 
     def _write_problem(self, event: ProblemPosed) -> None:
         problem = event.problem
@@ -190,10 +190,12 @@ class McapRecorder(Recorder):
         elites = self._last_elites
         if elites is not None and digest(problem.low_cost_set) == digest(elites):
             values["low_cost_set"] = None
-        self._record(event.topic, event.step, values)
+        self._record(event.topic, event.step, values=values)
 
     def _write_decision(self, event: Decided) -> None:
-        problem, start, offered = event.problem, self._start, self._offered
+        problem = event.problem
+        start = self._start
+        offered = self._offered
         assert start is not None
         if offered is None or not (
             self._is_given(problem)
@@ -206,7 +208,7 @@ class McapRecorder(Recorder):
                 f"the problem of the decision of step {event.step} has points, a grid, a "
                 "workspace, actions or a hand that the events before it do not give"
             )
-        self._record(event.topic, event.step, event_values(event))
+        self._record(event.topic, event.step, values=event_values(event))
 
     def _is_given(self, problem: RegistrationProblem | DecisionProblem) -> bool:
         """Return whether points and grid of a problem are those of the events before."""
@@ -222,7 +224,7 @@ class McapRecorder(Recorder):
         if found.archive is not None:
             repeats = last is not None and _same(last, SnapshotTaken(event.step, found.archive))
         values |= {"archive": None if repeats else archive, "archive_is_last_snapshot": repeats}
-        self._record(event.topic, event.step, values, archive=archive)
+        self._record(event.topic, event.step, values=values, archive=archive)
         self._last_elites = found.elites
 
     def _hypotheses_values(self, event: HypothesesFound) -> dict[str, Any]:
@@ -233,16 +235,16 @@ class McapRecorder(Recorder):
         values |= {"step": event.step, "archive": archive, "archive_is_last_snapshot": False}
         return values
 
-    def _record(self, topic: str, step: int, values: dict[str, Any], **repeated: Any) -> None:
+    def _record(self, topic: str, step: int, *, values: dict[str, Any], **repeated: Any) -> None:
         """Write a message of the project's own.
 
         repeated: values that it leaves out, as they stand in a message before it.
         """
         check_message(RECORDS[topic], values | repeated)
         data = encode(RECORDS[topic], values)
-        self._add(topic, step, lambda time: data)
+        self._add(topic, step, make=lambda time: data)
 
-    def _add(self, topic: str, step: int, make: Callable[[int], bytes]) -> None:
+    def _add(self, topic: str, step: int, *, make: Callable[[int], bytes]) -> None:
         """Write a message of a step; make: its bytes, from its log time."""
         time = (step - BEFORE_ALL_STEPS) * STEP_TIME + self._count
         self._writer.add_message(

@@ -44,7 +44,7 @@ class ArchiveMap:
         side = max(width, height)
         labels = rr.Points2D(
             [(width / 2, -0.12 * side), (width / 2, height + 0.03 * side)],
-            labels=_texts(step, archive, scale),
+            labels=_texts(step, archive, scale=scale),
             colors=[TEXT],
             radii=on_screen(0.0),
             show_labels=True,
@@ -79,7 +79,8 @@ def lowest_costs(archive: ArchiveSnapshot) -> np.ndarray:
     The first measure runs to the right, the second upwards; one measure alone makes a strip.
     """
     columns, rows = _places(archive, archive.cells)
-    width, height = archive.shape[0], _rows(archive)
+    width = archive.shape[0]
+    height = _rows(archive)
     costs = np.full((height, width), np.inf)
     np.minimum.at(costs, (height - 1 - rows, columns), -archive.objectives)
     costs[np.isinf(costs)] = np.nan
@@ -107,7 +108,7 @@ def _places(archive: ArchiveSnapshot, cells: IntArray) -> tuple[IntArray, IntArr
     return columns, rows
 
 
-def _texts(step: int, archive: ArchiveSnapshot, scale: CostScale) -> list[str]:
+def _texts(step: int, archive: ArchiveSnapshot, *, scale: CostScale) -> list[str]:
     """Return the caption with the upward measure, and the label of the one to the right."""
     refinement = f", refinement {archive.refinement}" if archive.refinement else ""
     caption = (

@@ -51,7 +51,7 @@ _FEWEST_FACES = 1_000
 
 
 def save_comparison(
-    path: Path, recording: Recording, results: Mapping[str, Mapping[int, Hypotheses]]
+    path: Path, recording: Recording, *, results: Mapping[str, Mapping[int, Hypotheses]]
 ) -> None:
     """Write a new .rrd: a 3-D view for each method, curves of all below, at the last of the steps.
 
@@ -65,7 +65,8 @@ def save_comparison(
         raise RecordingError("there is no result to compare; accepted: at least one")
     recording.checked_steps(steps)
     with new_file_stream(path, APPLICATION) as stream:
-        drawing, drawn = _Comparison(stream, recording, list(results)), set[int]()
+        drawing = _Comparison(stream, recording, labels=list(results))
+        drawn = set[int]()
         for event in recording.events(images=False):
             if isinstance(event, Probe):
                 if event.step > steps[-1]:
@@ -82,7 +83,7 @@ class _Comparison:
     """One scene for all methods, and the results of each at entities of its number."""
 
     def __init__(
-        self, stream: rr.RecordingStream, recording: Recording, labels: Sequence[str]
+        self, stream: rr.RecordingStream, recording: Recording, *, labels: Sequence[str]
     ) -> None:
         start = recording.start
         self._stream, self._recording = stream, recording
@@ -95,13 +96,13 @@ class _Comparison:
         stream.send_blueprint(_blueprint(start.workspace, self._labels, pose_known=pose_known))
         stream.set_time(PROBE, sequence=min((p.step for p in recording.probes), default=0))
         mesh = coarsened(start.mesh)
-        self._scene.set_up(mesh, start.workspace, start.world_from_object)
+        self._scene.set_up(mesh, start.workspace, world_from_object=start.world_from_object)
         self._scene.add_points(start.initial_points)
         coarse = coarsened(mesh, max(_FACES // len(labels), _FEWEST_FACES))
         for n, label in enumerate(labels):
             self._meshes[n].set_up(coarse)
             for name in CURVES:
-                style_curve(stream, f"curves/{name}/{n}", label, SERIES[n % len(SERIES)])
+                style_curve(stream, f"curves/{name}/{n}", name=label, color=SERIES[n % len(SERIES)])
 
     def add_probe(self, probe: Probe) -> None:
         """Draw a probe in the scene."""
@@ -124,7 +125,7 @@ class _Comparison:
                 continue
             self._meshes[n].draw(hypotheses, scale)
             start = self._recording.start_at(problem.key.step)
-            numbers = numbers_under(judge, hypotheses, start)
+            numbers = numbers_under(judge, hypotheses, start=start)
             if has_pose(found[label]):
                 numbers["spread"] = trust_in(problem, found[label]).spread
             for which in ("best", "median"):
@@ -132,7 +133,9 @@ class _Comparison:
             for name, (_, unit) in CURVES.items():
                 if math.isfinite(numbers.get(name, math.nan)):
                     self._stream.log(f"curves/{name}/{n}", rr.Scalars(unit * numbers[name]))
-            self._summarise(n, _summary(hypotheses, scale, literal(self._cost.name), numbers))
+            self._summarise(
+                n, _summary(hypotheses, scale, cost=literal(self._cost.name), numbers=numbers)
+            )
 
     def _summarise(self, n: int, text: str) -> None:
         """Write a text below the view of a method."""
@@ -157,7 +160,7 @@ def ranked(hypotheses: Hypotheses, judge: CompiledCost) -> Hypotheses:
 
 
 def _summary(
-    hypotheses: Hypotheses, scale: CostScale, cost: str, numbers: Mapping[str, float]
+    hypotheses: Hypotheses, scale: CostScale, *, cost: str, numbers: Mapping[str, float]
 ) -> str:
     errors = [
         f"{which} {MILLIMETRES * numbers[f'{which}_position_error']:.1f} mm, "

@@ -12,7 +12,8 @@ from chsel.problem.registration_problem import Hypotheses
 from replay.colors import COSTS, SERIES, Rgb
 from replay.rerun.stream import ITERATION
 
-MILLIMETRES, DEGREES = 1e3, math.degrees(1.0)
+MILLIMETRES = 1e3
+DEGREES = math.degrees(1.0)
 _MEASURED = {  # where measured numbers are drawn, by part of their names, and the unit there
     "position_error": ("error/position", MILLIMETRES),
     "rotation_error": ("error/rotation", DEGREES),
@@ -34,7 +35,7 @@ class Curves:
         self._stream = stream
         self._named: list[str] = []
 
-    def add(self, entity: str, value: float, color: Rgb | None = None) -> None:
+    def add(self, entity: str, value: float, *, color: Rgb | None = None) -> None:
         """Add a number at this moment, by default in the next colour of its view."""
         if math.isfinite(value):
             self._style(entity, color)
@@ -46,7 +47,7 @@ class Curves:
         if len(cost):
             values = (cost.min(), np.median(cost), cost.max())
             for (name, color), value in zip(COSTS.items(), values, strict=True):
-                self.add(f"cost/{name}", float(value), color)
+                self.add(f"cost/{name}", float(value), color=color)
         self.add("distinct/hypotheses", float(hypotheses.distinct))
 
     def add_measured(self, name: str, value: float) -> None:
@@ -73,10 +74,15 @@ class Curves:
             siblings = sum(other.rpartition("/")[0] == view for other in self._named)
             self._named.append(entity)
             self.views.add(view)
-            style_curve(self._stream, entity, name.replace("_", " "), color or SERIES[siblings % 7])
+            style_curve(
+                self._stream,
+                entity,
+                name=name.replace("_", " "),
+                color=color or SERIES[siblings % 7],
+            )
 
 
-def style_curve(stream: rr.RecordingStream, entity: str, name: str, color: Rgb) -> None:
+def style_curve(stream: rr.RecordingStream, entity: str, *, name: str, color: Rgb) -> None:
     """Name and colour the curve at an entity."""
     line = rr.SeriesLines(names=[name], colors=[color], widths=[2.0])
     point = rr.SeriesPoints(names=[name], colors=[color], marker_sizes=[2.5])

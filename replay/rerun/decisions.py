@@ -45,7 +45,8 @@ class Decisions:
 
     def draw(self, event: Decided) -> None:
         """Colour the actions by score, and show the chosen one with the contacts it forecasts."""
-        decision, actions = event.decision, event.problem.actions
+        decision = event.decision
+        actions = event.problem.actions
         can = np.isfinite(decision.score)
         colors = np.full((len(can), 3), UNAVAILABLE, dtype=np.uint8)
         colors[can] = score_colors(score_fractions(decision.score[can]))

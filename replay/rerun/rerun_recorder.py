@@ -41,7 +41,7 @@ class RerunRecorder(Recorder):
     def __init__(self, path: Path | None, *, live: bool = False) -> None:
         self._path = path
         self._live = live
-        self._stream = new_stream(APPLICATION, path, live_sink() if live else None)
+        self._stream = new_stream(APPLICATION, path, viewer=live_sink() if live else None)
         self._closed = False
         self._clock = Clock(self._stream)
         self._scene = Scene(self._stream)
@@ -105,7 +105,7 @@ class RerunRecorder(Recorder):
         self._log_text("session", session_markdown(event), static=True)
         self._log_text("colors", COLORS, static=True)
         mesh = coarsened(event.mesh)
-        self._scene.set_up(mesh, event.workspace, event.world_from_object)
+        self._scene.set_up(mesh, event.workspace, world_from_object=event.world_from_object)
         self._scene.add_points(event.initial_points)
         self._meshes.set_up(mesh)
 

@@ -59,7 +59,7 @@ class Scene:
         self._has_hand = False
 
     def set_up(
-        self, mesh: trimesh.Trimesh, workspace: Workspace, world_from_object: FloatArray | None
+        self, mesh: trimesh.Trimesh, workspace: Workspace, *, world_from_object: FloatArray | None
     ) -> None:
         """Draw what does not change: the workspace, and the object at its true pose where known."""
         self._stream.log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -71,12 +71,13 @@ class Scene:
         self._stream.log("scene/workspace", box, static=True)
         self._first_pose = world_from_object
         if world_from_object is not None:
-            self.add_mesh("object", mesh, world_from_object, (*OBJECT, 255))
+            self.add_mesh("object", mesh, world_from_mesh=world_from_object, color=(*OBJECT, 255))
 
     def add_mesh(
         self,
         name: str,
         mesh: trimesh.Trimesh,
+        *,
         world_from_mesh: FloatArray,
         color: tuple[int, int, int, int],
     ) -> None:
@@ -94,10 +95,10 @@ class Scene:
     def add_points(self, points: KnownPoints) -> None:
         """Draw points that become known."""
         exact = points.sdf == 0.0
-        self._points("free", points.free, FREE_FAINT, size=0.9)
-        self._points("occupied", points.occupied, OCCUPIED, size=2.5)
-        self._points("known", points.known[~exact], KNOWN, size=3.0)
-        self._points("contacts", points.known[exact], CONTACT, size=5.0)
+        self._points("free", points.free, color=FREE_FAINT, size=0.9)
+        self._points("occupied", points.occupied, color=OCCUPIED, size=2.5)
+        self._points("known", points.known[~exact], color=KNOWN, size=3.0)
+        self._points("contacts", points.known[exact], color=CONTACT, size=5.0)
 
     def add_probe(self, probe: Probe) -> None:
         """Draw the gripper's path, contacts and new points, stronger for this probe."""
@@ -106,9 +107,9 @@ class Scene:
         if probe.world_from_object is not None and self._first_pose is not None:
             since = inverse(self._first_pose) @ probe.world_from_object
             self._stream.log("scene/object", mesh_poses(since[None]))
-        self._points("free/new", probe.new_points.free, FREE, size=1.4)
-        self._points("contacts/new", probe.contacts, CONTACT, size=7.0)
-        self._points("gripper/end", path[-1:, :3, 3], GRIPPER, size=4.0)
+        self._points("free/new", probe.new_points.free, color=FREE, size=1.4)
+        self._points("contacts/new", probe.contacts, color=CONTACT, size=7.0)
+        self._points("gripper/end", path[-1:, :3, 3], color=GRIPPER, size=4.0)
         strips = [path[:, :3, 3]] if len(path) > 1 else []
         for name, color, width in (("past", PAST, 0.4), ("path", GRIPPER, 0.8)):
             line = rr.LineStrips3D(strips, colors=[color], radii=on_screen(width))
@@ -138,7 +139,7 @@ class Scene:
         )
         self._stream.log("scene/modes", modes)
 
-    def _points(self, name: str, points: FloatArray, color: Rgb, *, size: float) -> None:
+    def _points(self, name: str, points: FloatArray, *, color: Rgb, size: float) -> None:
         drawn = rr.Points3D(points, colors=[color], radii=on_screen(size))
         self._stream.log(f"scene/{name}", drawn)
 
@@ -209,25 +210,27 @@ class HypothesisMeshes:
         scale: of the colours; by default that of the hypotheses shown.
         """
         shown = shown_hypotheses(hypotheses)
-        poses, cost = inverse(hypotheses.object_from_world[shown]), hypotheses.cost[shown]
+        poses = inverse(hypotheses.object_from_world[shown])
+        cost = hypotheses.cost[shown]
         levels = cost_levels(cost, scale)
         if len(levels):
             best = rr.Mesh3D.from_fields(albedo_factor=_color(levels[0], _BEST_ALPHA))
             self._stream.log(f"{self._root}/best", best)
         levels[:1] = -1
-        self._poses("best", poses[:1], cost[:1])
+        self._poses("best", poses[:1], cost=cost[:1])
         for level in range(LEVELS):
             chosen = levels == level
-            self._poses(_name(level), poses[chosen], cost[chosen])
+            self._poses(_name(level), poses[chosen], cost=cost[chosen])
 
     def hide(self) -> None:
         """Show none."""
         for name in ("best", *map(_name, range(LEVELS))):
-            self._poses(name, HIDDEN[:0], np.zeros(0))
+            self._poses(name, HIDDEN[:0], cost=np.zeros(0))
 
-    def _poses(self, name: str, world_from_object: FloatArray, cost: FloatArray) -> None:
+    def _poses(self, name: str, world_from_object: FloatArray, *, cost: FloatArray) -> None:
         if len(world_from_object) == 0:
-            world_from_object, cost = HIDDEN, np.full(1, np.nan)
+            world_from_object = HIDDEN
+            cost = np.full(1, np.nan)
         poses = mesh_poses(world_from_object)
         self._stream.log(f"{self._root}/{name}", poses, rr.AnyValues(cost=cost))
 

@@ -17,7 +17,10 @@ _MOST = 12  # sensors
 _DEEPEST = 0.010  # metres of deformation that have the last colour
 _FRUSTUM = 0.12  # metres from a camera to its picture plane
 _POINT_FILL = 0.25  # of the room that a point of a camera has in the scene
-_COUNTS, _LEFT_OUT, _NOTHING = 0, 1, 2  # classes of pixels
+# classes of pixels
+_COUNTS = 0
+_LEFT_OUT = 1
+_NOTHING = 2
 _CLASSES = {
     "depth": (
         (_COUNTS, "free along its ray", (*CONTACT, 0)),
@@ -69,7 +72,8 @@ class SensorImages:
 
     def _draw(self, image: SensorImage) -> None:
         image = display_size(image)
-        root, meter = f"sensors/{image.sensor}", 1.0 / image.unit
+        root = f"sensors/{image.sensor}"
+        meter = 1.0 / image.unit
         touch = image.kind == DEFORMATION
         values = rr.DepthImage(
             image.values,
@@ -86,7 +90,8 @@ class SensorImages:
 
     def _draw_camera(self, image: SensorImage, meter: float) -> None:
         """Draw a depth camera at its pose, and the points that it sees."""
-        entity, pose = f"scene/cameras/{image.sensor}", image.world_from_camera
+        entity = f"scene/cameras/{image.sensor}"
+        pose = image.world_from_camera
         height, width = image.values.shape
         fx, fy, cx, cy = image.intrinsics.tolist()
         pinhole = rr.Pinhole(

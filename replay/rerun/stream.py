@@ -18,7 +18,7 @@ _FLUSH_SECONDS = 10.0
 
 
 def new_stream(
-    application: str, path: Path | None, viewer: rr.GrpcSink | None = None
+    application: str, path: Path | None, *, viewer: rr.GrpcSink | None = None
 ) -> rr.RecordingStream:
     """Return a stream without clocks to a new file, a viewer, or both.
 

@@ -75,15 +75,16 @@ def verdict_markdown(values: Mapping[str, float], known: int) -> str:
     noise, outliers, misfit, modes, spread, verdict = (values.get(n, math.nan) for n in names)
     if verdict not in range(len(VERDICTS)) or not math.isfinite(modes):
         return ""
-    named, redundancy = VERDICTS[int(verdict)], max(known - FREEDOMS, 0)
+    named = VERDICTS[int(verdict)]
+    redundancy = max(known - FREEDOMS, 0)
     trust = Trust(
-        noise,
-        outliers,
-        misfit,
-        int(modes),
-        spread,
-        named,
-        redundancy,
+        noise=noise,
+        outliers=outliers,
+        misfit=misfit,
+        modes=int(modes),
+        spread=spread,
+        verdict=named,
+        redundancy=redundancy,
         limit=values.get("spread_limit"),
         centre_within=values.get("centre_within"),
         turn_within=values.get("turn_within"),

@@ -103,7 +103,8 @@ def scene_view(
     """
     lower, upper = workspace.bounds
     diagonal = float(np.linalg.norm(upper - lower))
-    centre, away = (lower + upper) / 2, _DIRECTION / np.linalg.norm(_DIRECTION)
+    centre = (lower + upper) / 2
+    away = _DIRECTION / np.linalg.norm(_DIRECTION)
     return rrb.Spatial3DView(
         origin="/scene",
         contents=["$origin/**", *(f"/{entity}/**" for entity in more)],
@@ -174,7 +175,8 @@ def _text_views() -> rrb.Container:
 
 def _up_to_now() -> rrb.VisibleTimeRanges:
     """Return all moments from the first one to that of the cursor, on every timeline."""
-    start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative(seq=0)
+    start = rrb.TimeRangeBoundary.infinite()
+    end = rrb.TimeRangeBoundary.cursor_relative(seq=0)
     return rrb.VisibleTimeRanges(
         [rrb.VisibleTimeRange(name, start=start, end=end) for name in (PROBE, ITERATION)]
     )

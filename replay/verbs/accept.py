@@ -51,7 +51,7 @@ def run(given: argparse.Namespace) -> int:
     paths = recordings_in(given.files)
     if not given.yes and not sys.stdin.isatty():
         raise RecordingError("nobody can be asked here; accepted: --yes")
-    return max([_accept(path, ask=not given.yes) for path in paths])
+    return max(_accept(path, ask=not given.yes) for path in paths)
 
 
 def _accept(path: Path, *, ask: bool) -> int:
@@ -129,15 +129,16 @@ def write_accepted(recording: Recording, path: Path) -> list[ResultChange]:
     """
     changes: list[ResultChange] = []
     seconds: dict[int, Timed] = {}
-    differing, sets = environment_differences(recording.start), PlausibleSets(recording)
+    differing = environment_differences(recording.start)
+    sets = PlausibleSets(recording)
     beliefs = BeliefSequence(recording)
     with closing(McapRecorder(path)) as recorder:
         for event in recomputed(recording, follow_computed=True):
             if isinstance(event, Recomputed):
                 posed = event.computed[0] if event.computed else None
                 if event.result is not None and isinstance(posed, ProblemPosed):
-                    registered = posed.problem, event.result
-                changes.append(_change(recording, event, sets, differing))
+                    problem, result = posed.problem, event.result
+                changes.append(_change(recording, event, sets=sets, differing=differing))
                 seconds[event.step] = Timed(event.step, event.seconds)
                 for inner in event.computed or event.recorded:
                     recorder.record(inner)
@@ -152,7 +153,7 @@ def write_accepted(recording: Recording, path: Path) -> list[ResultChange]:
             elif isinstance(event, Timed):
                 event = seconds.get(event.step, event)
             elif isinstance(event, Believed):
-                belief = beliefs.after(*registered)
+                belief = beliefs.after(problem, result)
                 if belief is None:
                     continue
                 event = belief.event(event.step)
@@ -161,18 +162,20 @@ def write_accepted(recording: Recording, path: Path) -> list[ResultChange]:
 
 
 def _change(
-    recording: Recording, found: Recomputed, sets: PlausibleSets, differing: tuple[str, ...]
+    recording: Recording, found: Recomputed, *, sets: PlausibleSets, differing: tuple[str, ...]
 ) -> ResultChange:
     verdict = Verdict.of(found, differing)
     recorded = result_in(found.recorded)
     new = found.result
     if recorded is None or new is None:
-        return ResultChange(verdict, {}, {})
+        return ResultChange(verdict, {}, new={})
     problem = recording.problem(found.step)
     old = _measured(found.recorded) | sets.numbers(problem, recorded)
     now = _measured(found.computed) | sets.numbers(problem, new)
     symmetry = object_symmetry(recording.start.mesh)
-    return ResultChange(verdict, old, now, best_pose_moves(recorded, new, symmetry))
+    return ResultChange(
+        verdict, old, new=now, moved=best_pose_moves(recorded, new, symmetry=symmetry)
+    )
 
 
 def _measured(events: Sequence[Event]) -> dict[str, float]:
@@ -187,7 +190,7 @@ def _measured(events: Sequence[Event]) -> dict[str, float]:
 
 
 def best_pose_moves(
-    recorded: Hypotheses, new: Hypotheses, symmetry: ObjectSymmetry
+    recorded: Hypotheses, new: Hypotheses, *, symmetry: ObjectSymmetry
 ) -> tuple[float, float]:
     """Return how far the new best pose is off the recorded one, metres and radians.
 
@@ -196,5 +199,7 @@ def best_pose_moves(
     if len(recorded.cost) == 0 or len(new.cost) == 0:
         return math.nan, math.nan
     world_from_recorded = inverse(recorded.object_from_world[0])
-    position, rotation = pose_errors(new.object_from_world[:1], world_from_recorded, symmetry)
+    position, rotation = pose_errors(
+        new.object_from_world[:1], world_from_recorded, symmetry=symmetry
+    )
     return float(position[0]), float(rotation[0])

@@ -97,42 +97,44 @@ def _compare_methods(given: argparse.Namespace, recording: Recording) -> int:
     if not recording.steps:
         raise RecordingError(f"recording {given.file} has no registration problem to compare on")
     steps = chosen_steps(given.steps, recording.steps)
-    methods = chosen(recording, METHOD, given.methods)
+    methods = chosen(recording, METHOD, words=given.methods)
     if given.out is not None and (len(steps), len(methods)) != (1, 1):
         raise SettingError("--out records one registration; accepted: with one method and one step")
-    sets = PlausibleSets(recording, given.plausible, given.definition)
+    sets = PlausibleSets(recording, given.plausible, definition=given.definition)
     cost = common_cost(recording)
-    found = compared(recording, methods, steps, cost, sets, out=given.out)
+    found = compared(recording, methods, steps=steps, cost=cost, plausible=sets, out=given.out)
     waiting = Console(stderr=True)
-    count, hidden = len(steps) * (len(methods) + 1), not waiting.is_terminal
+    count = len(steps) * (len(methods) + 1)
+    hidden = not waiting.is_terminal
     bar = track(found, "registering", count, console=waiting, transient=True, disable=hidden)
     outcomes = list(bar)
-    rows, console = frame(outcomes, methods, cost, given.definition), Console()
+    rows = frame(outcomes, methods, cost=cost, definition=given.definition)
+    console = Console()
     columns = {n: c for n, c in COLUMNS.items() if c.heading and rows[c.csv_name].notna().any()}
     others = [column for name, column in columns.items() if name not in _PLAUSIBLE]
     each = given.each or len(steps) <= _FEW_STEPS
-    _print_tables(console, f"costs of all by {cost.name}", others, rows, each=each)
+    _print_tables(console, f"costs of all by {cost.name}", columns=others, rows=rows, each=each)
     plausible = [columns[name] for name in _PLAUSIBLE if name in columns]
     if plausible:
         what = f"plausible sets by definition {given.definition}"
-        _print_tables(console, what, plausible, rows, each=each)
+        _print_tables(console, what, columns=plausible, rows=rows, each=each)
     console.print(
         "problems as recorded, with their E_0 and E_l; errors to the true pose modulo the "
         "object's symmetries, at its centre: of the best by cost, and of the nearest; ms: of one "
         f"registration by {given.threads} thread{'s' if given.threads > 1 else ''}"
     )
-    other_bits = [_print_bits(console, choice, outcomes) for choice in methods]
-    _print_rest(console, methods, rows)
+    other_bits = [_print_bits(console, choice, outcomes=outcomes) for choice in methods]
+    _print_rest(console, methods, rows=rows)
     if given.save_csv is not None:
         write_csv(rows, given.save_csv)
     if given.save_plot is not None:
         start = recording.start
         title = f"{start.object}, {start.session} session, seed {start.seed}, costs of all by "
-        write_plot(given.save_plot, rows, list(columns.values()), title + cost.name)
+        write_plot(given.save_plot, rows, columns=list(columns.values()), title=title + cost.name)
     if given.save_rerun is not None:
         from replay.rerun.comparison_view import save_comparison
 
-        save_comparison(given.save_rerun, recording, _results(recording, outcomes))
+        save_comparison(given.save_rerun, recording, results=_results(recording, outcomes))
     ours = [o.failure for o in outcomes if o.label != recorded_label(recording)]
     return int(any(ours) or any(other_bits))
 
@@ -142,13 +144,14 @@ def _compare_policies(given: argparse.Namespace, recording: Recording) -> int:
         raise SettingError("--policies writes tables alone; accepted: with --save-csv")
     require_steered(recording)
     steps = chosen_steps(given.steps, recording.decision_steps)
-    policies = chosen(recording, POLICY, given.policies)
-    rows, console = pd.DataFrame(policy_decisions(recording, policies, steps)), Console()
+    policies = chosen(recording, POLICY, words=given.policies)
+    rows = pd.DataFrame(policy_decisions(recording, policies, steps=steps))
+    console = Console()
     if given.each or len(steps) <= _FEW_STEPS:
         console.print(_decision_table(rows))
     if len(steps) > 1:
         console.print(_decision_medians(rows))
-    _print_rest(console, policies, rows)
+    _print_rest(console, policies, rows=rows)
     if given.save_csv is not None:
         write_csv(rows, given.save_csv)
     return int(rows["failure"].any())
@@ -175,25 +178,28 @@ def _checked_outputs(given: argparse.Namespace) -> list[Path]:
 
 
 def _print_tables(
-    console: Console, what: str, columns: Sequence[Column], rows: pd.DataFrame, *, each: bool
+    console: Console, what: str, *, columns: Sequence[Column], rows: pd.DataFrame, each: bool
 ) -> None:
     """Print a row for each step and method if wanted, and medians over several steps."""
-    headings, count = [column.heading for column in columns], rows["step"].nunique()
+    headings = [column.heading for column in columns]
+    count = rows["step"].nunique()
     if each:
         table = plain_table(f"each step, {what}", texts=["step", "method"], numbers=headings)
         for _, row in rows.iterrows():
-            _add(table, [str(row["step"]), row["label"]], columns, row)
+            _add(table, [str(row["step"]), row["label"]], columns=columns, row=row)
         console.print(table, "")
     if count > 1:
         title = f"medians over {count} steps, {what}"
         table = plain_table(title, texts=["method", "steps"], numbers=headings)
         for label, of_label in rows.groupby("label", sort=False):
             medians = of_label.median(numeric_only=True)
-            _add(table, [label, str((of_label["failure"] == "").sum())], columns, medians)
+            _add(
+                table, [label, str((of_label["failure"] == "").sum())], columns=columns, row=medians
+            )
         console.print(table, "")
 
 
-def _add(table: Table, texts: list[str], columns: Sequence[Column], row: pd.Series) -> None:
+def _add(table: Table, texts: list[str], *, columns: Sequence[Column], row: pd.Series) -> None:
     cells = [_shown_number(row.get(column.csv_name), column.times) for column in columns]
     if row.get("failure"):
         cells[0] = "failed"
@@ -240,7 +246,9 @@ def _decision_medians(rows: pd.DataFrame) -> Table:
     return table
 
 
-def _print_bits(console: Console, choice: Choice[Method], outcomes: Sequence[Outcome]) -> list[str]:
+def _print_bits(
+    console: Console, choice: Choice[Method], *, outcomes: Sequence[Outcome]
+) -> list[str]:
     """Say whether a method with the recorded settings gives what was recorded; steps if not."""
     known = [o for o in outcomes if o.label == choice.label and o.as_recorded is not None]
     other = [str(outcome.step) for outcome in known if not outcome.as_recorded]
@@ -253,7 +261,7 @@ def _print_bits(console: Console, choice: Choice[Method], outcomes: Sequence[Out
     return other
 
 
-def _print_rest(console: Console, choices: Sequence[Choice[Any]], rows: pd.DataFrame) -> None:
+def _print_rest(console: Console, choices: Sequence[Choice[Any]], *, rows: pd.DataFrame) -> None:
     """Print the changes of settings, and what failed."""
     for choice in choices:
         if choice.changes:
@@ -275,7 +283,7 @@ def _results(recording: Recording, outcomes: Sequence[Outcome]) -> dict[str, dic
     return results
 
 
-def write_plot(path: Path, rows: pd.DataFrame, columns: Sequence[Column], title: str) -> None:
+def write_plot(path: Path, rows: pd.DataFrame, *, columns: Sequence[Column], title: str) -> None:
     """Write a new picture with a panel for every column over the steps, a line for each method.
 
     What failed, and costs that are infinite, are gaps.
@@ -307,7 +315,7 @@ def write_plot(path: Path, rows: pd.DataFrame, columns: Sequence[Column], title:
 
 
 def policy_decisions(
-    recording: Recording, policies: Sequence[Choice[Policy]], steps: Sequence[int]
+    recording: Recording, policies: Sequence[Choice[Policy]], *, steps: Sequence[int]
 ) -> Iterator[dict[str, Any]]:
     """Yield a row for each step and policy, the recorded decision first; names have units.
 
@@ -320,7 +328,8 @@ def policy_decisions(
     name = group.get("name") if isinstance(group, dict) else None
     for step in steps:
         decided = recording.decision(step)
-        actions, recorded = decided.problem.actions, decided.decision
+        actions = decided.problem.actions
+        recorded = decided.decision
         first = {"step": step, "label": f"recorded: {name}", "failure": "", "changes": ""}
         yield first | _cells(actions, recorded) | {"as_recorded": None}
         for choice, policy in built:

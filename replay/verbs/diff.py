@@ -22,7 +22,9 @@ from replay.comparing.differences import Content, Difference, content, differenc
 from replay.console import Console, plain_table
 from replay.mcap.reader import Recording, read_recording
 
-BOTH, FIRST, SECOND = "both", "first", "second"
+BOTH = "both"
+FIRST = "first"
+SECOND = "second"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> int:
     """Print the first difference, a table by topic, and the differences themselves."""
-    found = recording_diff(given.first, given.second, given.ignore)
+    found = recording_diff(given.first, given.second, ignored=given.ignore)
     console = Console(soft_wrap=True)
     if not found.differences:
         but = f", leaving out {', '.join(given.ignore)}" if given.ignore else ""
@@ -116,7 +118,7 @@ class RecordingDiff:
     differences: list[EventDifference] = field(default_factory=list)
 
 
-def recording_diff(first: Path, second: Path, ignored: Sequence[str] = ()) -> RecordingDiff:
+def recording_diff(first: Path, second: Path, *, ignored: Sequence[str] = ()) -> RecordingDiff:
     """Compare two recordings, step by step.
 
     ignored: topics, such as "/timed", and fields with what is nested in them, such as
@@ -136,7 +138,7 @@ def recording_diff(first: Path, second: Path, ignored: Sequence[str] = ()) -> Re
             if place.topic.strip("/") not in {word.strip("/") for word in ignored}:
                 found.counts[place.topic] += 1
                 one, other = (of.get(place) for of in events)
-                found.differences += _differences(place, one, other, ignored)
+                found.differences += _differences(place, one, second=other, ignored=ignored)
     return found
 
 
@@ -147,13 +149,13 @@ def _steps(recording: Recording, side: int) -> Iterator[tuple[int, int, dict[Pla
         numbers: Counter[tuple[str, int, str]] = Counter()
         for event in events:
             name = event_name(event)
-            contents[Place(*name, numbers[name])] = content(event)
+            contents[Place(name[0], name[1], about=name[2], number=numbers[name])] = content(event)
             numbers[name] += 1
         yield step, side, contents
 
 
 def _differences(
-    place: Place, first: Content | None, second: Content | None, ignored: Sequence[str]
+    place: Place, first: Content | None, *, second: Content | None, ignored: Sequence[str]
 ) -> list[EventDifference]:
     if first is None or second is None:
         having = SECOND if first is None else FIRST

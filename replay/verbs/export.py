@@ -60,7 +60,7 @@ def exported_hypotheses(recording: Recording, steps: str | None) -> Exported:
     rounded; m00 to m33 are object_from_world, exact.
     """
     results = [step for step in recording.steps if recording.has_result(step)]
-    chosen = _chosen(recording, steps, results, "result")
+    chosen = _chosen(recording, steps, existing=results, name="result")
     arrays: dict[str, Any] = {"steps": np.array(chosen, dtype=np.int64)}
     if recording.start.world_from_object is not None:
         arrays["true_world_from_object"] = recording.start.world_from_object
@@ -98,7 +98,7 @@ def exported_points(recording: Recording, steps: str | None) -> Exported:
     existing = list(dict.fromkeys(step for step, _ in news))
     if not any(new.count for _, new in news):
         existing = []
-    chosen = _chosen(recording, steps, existing, "point")
+    chosen = _chosen(recording, steps, existing=existing, name="point")
     news = [(step, new) for step, new in news if step in chosen]
     arrays: dict[str, Any] = {"known_sdf": np.concatenate([new.sdf for _, new in news])}
     tables = []
@@ -122,7 +122,9 @@ def exported_archive(recording: Recording, steps: str | None) -> Exported:
     `objectives` (C,), `measures` (C, k), `solutions` (C, d). Table: a row an occupied cell.
     """
     taken = {step: _archives(recording, step) for step in recording.steps}
-    chosen = _chosen(recording, steps, [step for step in taken if taken[step]], "archive")
+    chosen = _chosen(
+        recording, steps, existing=[step for step in taken if taken[step]], name="archive"
+    )
     arrays: dict[str, Any] = {"steps": np.array(chosen, dtype=np.int64)}
     tables = []
     for step in chosen:
@@ -160,7 +162,7 @@ def exported_metrics(recording: Recording, steps: str | None) -> Exported:
             source = event.topic.strip("/")
             rows += [(event.step, source, *item) for item in step_numbers(event).items()]
     existing = sorted({row[0] for row in rows})
-    chosen = _chosen(recording, steps, existing, "number about a step")
+    chosen = _chosen(recording, steps, existing=existing, name="number about a step")
     table = pd.DataFrame(rows, columns=["step", "source", "name", "value"])
     table = table[table["step"].isin(chosen)]
     arrays = {name: table[name].to_numpy() for name in table}
@@ -176,7 +178,7 @@ def exported_images(recording: Recording, steps: str | None) -> Exported:
     the pixels that count, `intrinsics` (4,), fx, fy, cx, cy in pixels, and `world_from_camera`
     (4, 4). Table: a row an image, without its pixels; m00 to m33 are world_from_camera.
     """
-    chosen = _chosen(recording, steps, recording.image_steps, "image of a sensor")
+    chosen = _chosen(recording, steps, existing=recording.image_steps, name="image of a sensor")
     rows = [
         {
             "step": seen.step,
@@ -209,12 +211,13 @@ def exported_decisions(recording: Recording, steps: str | None) -> Exported:
     `step_K/length` and `step_K/seconds` have them. Table: a row a decision; x, y, z (metres) are
     the start of the chosen action, dx, dy, dz its direction.
     """
-    chosen = _chosen(recording, steps, recording.decision_steps, "decision")
+    chosen = _chosen(recording, steps, existing=recording.decision_steps, name="decision")
     assert recording.offered is not None  # as there is a decision
     first = recording.offered.actions
     arrays: dict[str, Any] = {"steps": np.array(chosen, dtype=np.int64)}
     arrays |= {f"actions/{name}": part for name, part in _parts_of(first).items()}
-    config, rows = recording.start.config.get("policy"), []
+    config = recording.start.config.get("policy")
+    rows = []
     policy = config.get("name", "") if isinstance(config, Mapping) else ""
     for step in chosen:
         decided = recording.decision(step)
@@ -256,7 +259,7 @@ def exported_modes(recording: Recording, steps: str | None) -> Exported:
     """
     believed = {e.step: e for e in recording.events(images=False) if isinstance(e, Believed)}
     believed = believed or {e.step: e for e in _beliefs(recording)}
-    chosen = _chosen(recording, steps, [*believed], "belief")
+    chosen = _chosen(recording, steps, existing=[*believed], name="belief")
     arrays: dict[str, Any] = {"steps": np.array(chosen, dtype=np.int64)}
     tables = []
     for step in chosen:
@@ -320,7 +323,7 @@ def run(given: argparse.Namespace) -> int:
     recording = read_recording(given.file)
     exported = EXPORTS[given.what](recording, given.steps)
     path = given.out or Path(f"{recording.path.stem}_{given.what}.{file_format}")
-    write_export(exported, path, file_format)
+    write_export(exported, path, file_format=file_format)
     console = Console(soft_wrap=True)
     console.print(f"{path}  {decimal(path.stat().st_size)}")
     if given.what == "points" and file_format != "json":
@@ -334,7 +337,7 @@ def run(given: argparse.Namespace) -> int:
     return 0
 
 
-def write_export(exported: Exported, path: Path, file_format: str) -> None:
+def write_export(exported: Exported, path: Path, *, file_format: str) -> None:
     """Write a new file. RecordingError if it exists or cannot be written."""
     table = exported.table
     with new_file(path) as beside, beside.open("xb") as file:
@@ -349,7 +352,7 @@ def write_export(exported: Exported, path: Path, file_format: str) -> None:
 
 
 def _chosen(
-    recording: Recording, steps: str | None, existing: Sequence[int], name: str
+    recording: Recording, steps: str | None, *, existing: Sequence[int], name: str
 ) -> tuple[int, ...]:
     """Return the chosen steps that have what is asked for; raise RecordingError if none has."""
     if not existing:

@@ -45,13 +45,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> int:
     """Print what is in the files; a list in JSON if there are several."""
-    console, documents, status = Console(), [], 0
+    console = Console()
+    documents = []
+    status = 0
     for file in given.files:
         try:
             info = log_info(file) if is_other_programs(file) else recording_info(file)
         except (RecordingError, SessionError) as error:
             print_error(str(error))
-            info, status = {"path": file, "error": str(error)}, 2
+            info = {"path": file, "error": str(error)}
+            status = 2
         else:
             status = max(status, int(not info["integrity"]["whole"]))
             if not given.json:
@@ -72,7 +75,9 @@ def recording_info(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path).expanduser()
     recording = read_recording(path, partial=True)
-    start, damage, decision = recording.start, recording.damage, None
+    start = recording.start
+    damage = recording.damage
+    decision = None
     try:
         for event in recording.events():  # which compares the digests of all problems
             if isinstance(event, Probe):
@@ -85,7 +90,8 @@ def recording_info(path: str | Path) -> dict[str, Any]:
     for message in McapFile(path, TOPIC_SCHEMAS, partial=True).messages():
         messages[message.topic] += 1
         sizes[message.topic] += len(message.data)
-    rows, policy = step_rows(recording), _name(start.config, "policy")
+    rows = step_rows(recording)
+    policy = _name(start.config, "policy")
     stopped: dict[str, Any] = {"stop": None, "spread": None}
     if decision is not None:
         stopped = {"stop": decision.stop, "spread": decision.spread}
@@ -166,7 +172,8 @@ def log_info(path: str | Path) -> dict[str, Any]:
     begin and end: first and last log time, nanoseconds, 0 without messages; rate: messages a
     second over that span. Raise SessionError for a file that cannot be read, or is not MCAP.
     """
-    file, faults = RawFile(Path(path).expanduser()), list[str]()
+    file = RawFile(Path(path).expanduser())
+    faults = list[str]()
     counts: Counter[Channel] = Counter()
     times = file.times
     if not file.is_indexed:
@@ -218,8 +225,7 @@ def _log_tables(info: Mapping[str, Any]) -> tuple[Table, Table]:
     table = plain_table("", texts=("topic", "type", "encoding"), numbers=("messages", "Hz"))
     for topic in info["topics"]:
         rate = "" if topic["rate"] is None else f"{topic['rate']:.4g}"
-        names = (topic["topic"], topic["type"], topic["encoding"])
-        table.add_row(*names, str(topic["count"]), rate)
+        table.add_row(topic["topic"], topic["type"], topic["encoding"], str(topic["count"]), rate)
     return _fact_table(facts), table
 
 
@@ -260,7 +266,8 @@ def _facts(info: Mapping[str, Any]) -> dict[str, str]:
         sizes[name] += size
     messages = (f"{counts[name]} {name} ({decimal(size)})" for name, size in sizes.most_common())
     versions = (f"{k.removeprefix('package ')} {v}" for k, v in info["environment"].items())
-    damage, path = info["integrity"]["damage"], Path(info["path"])
+    damage = info["integrity"]["damage"]
+    path = Path(info["path"])
     integrity = "finished; all checksums and digests are right"
     if damage is not None:
         integrity = f"{damage}; what is whole was read, and {recover_hint(path)}"

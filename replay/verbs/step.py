@@ -56,11 +56,15 @@ def run(given: argparse.Namespace) -> int:
     parser = argparse.ArgumentParser()
     compare.add_arguments(parser)
     asked = parser.parse_args(["", "--methods", "", "--each"])
-    asked.file, asked.steps, asked.save_rerun = given.file, str(given.step), given.save_rerun
+    asked.file = given.file
+    asked.steps = str(given.step)
+    asked.save_rerun = given.save_rerun
     if given.policy:
         if given.method:
             raise SettingError("--policy registers nothing; accepted: with FILE and --step")
-        asked.methods, asked.policies, asked.out = None, _policies(given.policy), given.out
+        asked.methods = None
+        asked.policies = _policies(given.policy)
+        asked.out = given.out
         return compare.run(asked)
     names = [word for word in given.method if "=" not in word]
     if len(names) > 1:

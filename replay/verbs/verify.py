@@ -38,7 +38,8 @@ def run(given: argparse.Namespace) -> int:
     require_threads("--jobs", given.jobs)
     console = Console(soft_wrap=True)
     paths = recordings_in(given.files)
-    begun, files = time.perf_counter(), []
+    begun = time.perf_counter()
+    files = []
     for file in verified_files(paths, given.step, jobs=given.jobs):
         _print(console, file)
         files.append(file)

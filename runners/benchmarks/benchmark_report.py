@@ -15,7 +15,7 @@ _COMPARED = "registration"
 _VERSIONS = ("numpy", "torch", "numba")
 
 
-def write(folder: Path, rows: Sequence[Row], about: Mapping[str, Any]) -> None:
+def write(folder: Path, rows: Sequence[Row], *, about: Mapping[str, Any]) -> None:
     """Write all numbers as benchmark.json, and speed.md. about: machine and settings."""
     report = {**about, "rows": [row.mapping() for row in rows]}
     write_in_run_folder(folder / "benchmark.json", json.dumps(report, indent=2) + "\n")
@@ -49,7 +49,7 @@ def page(rows: Sequence[Row], about: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def slower(rows: Sequence[Row], row: Row, package: str) -> float | None:
+def slower(rows: Sequence[Row], row: Row, *, package: str) -> float | None:
     """Return how many times as long as one of ours the package takes on the same problem."""
     beside = [other for other in rows if (other.case, other.who) == (row.case, package)]
     if row.who.startswith(PACKAGE) or not beside:
@@ -63,7 +63,7 @@ def _comparison(rows: Sequence[Row]) -> list[dict[str, str]]:
     for row in rows:
         line = {"problem": row.case, "registration": row.who, **_numbers(row)}
         for package in packages:
-            ratio = slower(rows, row, package)
+            ratio = slower(rows, row, package=package)
             heading = package.replace(PACKAGE, "x").replace(",", "")
             line[heading] = "" if ratio is None else number(ratio)
         lines.append(line | {"cost": "" if row.cost is None else number(row.cost)})

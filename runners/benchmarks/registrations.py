@@ -53,7 +53,7 @@ class Steps(CheckedSettings):
     long_search: Annotated[int, positive] = 500  # the same, in the longer row
 
 
-store("effort", "default", settings_mapping(Steps()))
+store("effort", "default", node=settings_mapping(Steps()))
 
 
 @dataclass(frozen=True)
@@ -140,16 +140,25 @@ def pose(problem: Problem, seed: int) -> RegistrationProblem:
     spacing = round(float(np.cbrt(volume / problem.free_points)), 4)  # whole tenths of a millimetre
     surface = trimesh.sample.sample_surface(mesh, problem.contacts, seed=seed)[0]
     contacts = apply(world_from_object, np.asarray(surface, dtype=np.float64))
-    points = KnownPoints(free=_outside(mesh, world_from_object, spacing), known=contacts)
+    points = KnownPoints(free=_outside(mesh, world_from_object, spacing=spacing), known=contacts)
     settings = OnlineSettings(hypotheses=problem.hypotheses)
-    initial_set = first_initial_set(WORKSPACE, points, StreamKey(seed, 0), settings)
-    return RegistrationProblem(sdf, points, initial_set, WORKSPACE, spacing, StreamKey(0, 0))
+    initial_set = first_initial_set(WORKSPACE, points, key=StreamKey(seed, 0), settings=settings)
+    return RegistrationProblem(
+        sdf=sdf,
+        points=points,
+        initial_set=initial_set,
+        workspace=WORKSPACE,
+        free_resolution=spacing,
+        key=StreamKey(0, 0),
+    )
 
 
 @lru_cache
 def drill(scale: float) -> tuple[trimesh.Trimesh, SdfGrid]:
     """Return the mesh of the model, and its signed distance grid."""
-    mesh = load_object(ObjectConfig("drill", scale, 0.001, "drill"), Path()).mesh
+    mesh = load_object(
+        ObjectConfig("drill", scale, epsilon=0.001, configuration="drill"), Path()
+    ).mesh
     return mesh, SdfGrid.from_mesh(mesh, _SDF_RESOLUTION)
 
 
@@ -162,7 +171,7 @@ def standing(mesh: trimesh.Trimesh) -> FloatArray:
     return compose(turn, middle - turn @ foot)
 
 
-def _outside(mesh: trimesh.Trimesh, world_from_object: FloatArray, spacing: float) -> FloatArray:
+def _outside(mesh: trimesh.Trimesh, world_from_object: FloatArray, *, spacing: float) -> FloatArray:
     """Return the points (N, 3) of a lattice in the workspace that are outside of the object."""
     # At whole multiples of the spacing, where the published package has its voxels, too.
     lower, upper = WORKSPACE.bounds
@@ -193,7 +202,7 @@ class BenchmarkError(ChselError):
     """The error that both sides would not do the same work."""
 
 
-def method(name: str, steps: Steps, search: int) -> Method:
+def method(name: str, steps: Steps, *, search: int) -> Method:
     """Return one of OURS: with all steps done, or as it ships but for a search that is longer."""
     if name in SIZES:
         settings = replace(preset_settings("anchored"), size=name.removeprefix("anchored, "))
@@ -212,6 +221,7 @@ def method(name: str, steps: Steps, search: int) -> Method:
 def register(
     problem: RegistrationProblem,
     name: str,
+    *,
     steps: Steps,
     search: int,
     observer: Observer | None = None,
@@ -219,12 +229,12 @@ def register(
     """Return milliseconds from arrays to hypotheses by one of OURS, and these."""
     begun = time.perf_counter()
     fresh = replace(problem, points=replace(problem.points))  # which has nothing computed yet
-    found = method(name, steps, search).register(fresh, observer)
+    found = method(name, steps, search=search).register(fresh, observer)
     return 1000.0 * (time.perf_counter() - begun), found
 
 
 def compare(
-    name: str, scope: Scope, package: PublishedPackage | None, *, equation: bool
+    name: str, scope: Scope, *, package: PublishedPackage | None, equation: bool
 ) -> Iterator[Row]:
     """Yield rows of one of PROBLEMS: OURS, and in turn with them the package.
 
@@ -232,12 +242,13 @@ def compare(
     free term as well, a third as often, the first one included. cost: of the best pose under the
     paper's equation, the same measure for everyone.
     """
-    problem, steps = pose(PROBLEMS[name], scope.seed), scope.steps
+    problem = pose(PROBLEMS[name], scope.seed)
+    steps = scope.steps
     search = steps.long_search if PROBLEMS[name].long else steps.search
     found: dict[str, FloatArray] = {}  # poses (B, 4, 4) by who found them
 
     def ours(who: str, name: str) -> float:
-        taken, hypotheses = register(problem, name, steps, search)
+        taken, hypotheses = register(problem, name, steps=steps, search=search)
         found[who] = hypotheses.object_from_world
         return taken
 
@@ -269,7 +280,7 @@ def compare(
     cost = RelaxedCost.of(problem, in_preset(CostSettings(), "paper"))
     for who, taken in samples.items():
         least = float(cost.evaluate(found[who]).min())
-        yield Row("registration", name, who, "ms", taken, cost=least)
+        yield Row("registration", name, who=who, unit="ms", samples=taken, cost=least)
 
 
 class StageTimer(NullObserver):
@@ -279,7 +290,7 @@ class StageTimer(NullObserver):
         self.seconds: dict[str, float] = {}
         self._mark = time.perf_counter()
 
-    def progress(self, stage: str, iteration: int, total: int) -> None:
+    def progress(self, stage: str, iteration: int, total: int) -> None:  # noqa: PLR0917
         """Count the time since the last report for the stage."""
         now = time.perf_counter()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._mark
@@ -293,12 +304,14 @@ def stages(scope: Scope) -> Iterator[Row]:
         parts: dict[str, list[float]] = {}
         for _ in range(scope.repeats + 1):
             timer = StageTimer()
-            total, _ = register(problem, name, scope.steps, scope.steps.search, timer)
+            total, _ = register(
+                problem, name, steps=scope.steps, search=scope.steps.search, observer=timer
+            )
             taken = {stage: 1000.0 * seconds for stage, seconds in timer.seconds.items()}
             for stage, value in (taken | {"other": total - sum(taken.values())}).items():
                 parts.setdefault(stage, []).append(value)
         for stage, samples in parts.items():
-            yield Row("stage", stage, name, "ms", tuple(samples[1:]))
+            yield Row("stage", stage, who=name, unit="ms", samples=tuple(samples[1:]))
 
 
 def threads(scope: Scope) -> Iterator[Row]:
@@ -306,14 +319,14 @@ def threads(scope: Scope) -> Iterator[Row]:
     for case in ("real_20", "large_20"):
         problem = pose(PROBLEMS[case], scope.seed)
         for name in (*PRESETS, "anchored, medium"):
-            once = partial(register, problem, name, scope.steps, scope.steps.search)
+            once = partial(register, problem, name, steps=scope.steps, search=scope.steps.search)
             samples = in_turn(
                 scope.repeats, {str(n): partial(milliseconds, once, n) for n in _THREADS}
             )
             for count, taken in samples.items():
-                yield Row("threads", f"{case}, {count}", name, "ms", taken)
+                yield Row("threads", f"{case}, {count}", who=name, unit="ms", samples=taken)
             ratios = np.divide(samples["1"], samples["2"]).tolist()
-            yield Row("speed-up", case, name, "x", tuple(ratios))
+            yield Row("speed-up", case, who=name, unit="x", samples=tuple(ratios))
 
 
 def methods(scope: Scope) -> Iterator[Row]:
@@ -325,7 +338,7 @@ def methods(scope: Scope) -> Iterator[Row]:
 
     cases = {name: partial(milliseconds, partial(register_with, name)) for name in METHODS}
     for name, taken in in_turn(scope.repeats, cases).items():
-        yield Row("method", name, "default", "ms", taken)
+        yield Row("method", name, who="default", unit="ms", samples=taken)
 
 
 def plausible_sets(scope: Scope) -> Iterator[Row]:
@@ -333,10 +346,10 @@ def plausible_sets(scope: Scope) -> Iterator[Row]:
     settings = plausible_settings("default", 0.001)
     truth = standing(drill(1.0)[0])
     for case in ("real_20", "real_150"):
-        once = partial(plausible_set, pose(PROBLEMS[case], scope.seed), truth, settings)
+        once = partial(plausible_set, pose(PROBLEMS[case], scope.seed), truth, settings=settings)
         named = {f"{case}, {n}": partial(milliseconds, once, n) for n in _THREADS}
         for name, taken in in_turn(scope.repeats, named).items():
-            yield Row("plausible, threads", name, "default", "ms", taken)
+            yield Row("plausible, threads", name, who="default", unit="ms", samples=taken)
 
 
 MEASURES: dict[str, Callable[[Scope], Iterator[Row]]] = {

@@ -39,41 +39,45 @@ def calls_for_anchored(session: str, policy: str) -> str:
     return f"session={session}" if session in kinds_of(ObjectOrigin.REAL) else ""
 
 
-def _method(session: str, policy: str, preset: str) -> str:
+def _method(session: str, policy: str, preset: str) -> str:  # noqa: PLR0917
     return default_method(preset) if calls_for_anchored(session, policy) else "chsel"
 
 
 @cache
 def store_choices() -> None:
     """Offer all that the code knows by name, with its settings. Once in a process."""
-    store("", "base", {"hydra": {"output_subdir": None, "run": {"dir": "."}}}, package="_global_")
+    store(
+        "", "base", node={"hydra": {"output_subdir": None, "run": {"dir": "."}}}, package="_global_"
+    )
     assets = '${oc.env:CHSEL_ASSETS,"~/.cache/chsel/ycb"}'
-    store("assets", "default", {"dir": assets, "url": URL})
+    store("assets", "default", node={"dir": assets, "url": URL})
     for choice, config in OBJECTS.items():
         group, _, name = f"object/{choice}".rpartition("/")
-        store(group, name, settings_mapping(config), package="object")
+        store(group, name, node=settings_mapping(config), package="object")
     mesh = {"name": "mesh", "kind": "file", "scale": 1.0, "epsilon": 0.001, "scan": None}
-    store("object", "mesh", {**mesh, "configuration": FITTED, "path": None})
+    store("object", "mesh", node={**mesh, "configuration": FITTED, "path": None})
     for name, written in (
         ("both", RecordingConfig()),
         ("mcap", RecordingConfig(rerun=False)),
         ("rerun", RecordingConfig(mcap=False)),
         ("none", RecordingConfig(mcap=False, rerun=False)),
     ):
-        store("recording", name, settings_mapping(written))
-    store("grasp", "default", settings_mapping(GraspConfig()))
+        store("recording", name, node=settings_mapping(written))
+    store("grasp", "default", node=settings_mapping(GraspConfig()))
     for preset in PRESETS:
-        store("preset", preset, {"name": preset})
-    store("search", "default", settings_mapping(TruePoseSettings()))
+        store("preset", preset, node={"name": preset})
+    store("search", "default", node=settings_mapping(TruePoseSettings()))
     for method in METHODS:
         _store_with_presets("method", method, partial(preset_settings, method), {"name": method})
     for policy in POLICIES:
         with suppress(SettingError):  # of an installed policy; who chooses it gets the message
-            store("policy", policy, {"name": policy, **settings_mapping(policy_settings(policy))})
+            store(
+                "policy", policy, node={"name": policy, **settings_mapping(policy_settings(policy))}
+            )
     for name in DEFINITIONS:
         values = settings_mapping(plausible_settings(name, 1.0))
         # None: that of the object.
-        store("definition", name, {"name": name, **values, "epsilon": None})
+        store("definition", name, node={"name": name, **values, "epsilon": None})
     _store_sessions()
 
 
@@ -86,12 +90,12 @@ def _store_sessions() -> None:
             _store_with_presets("session", name, settings, node, *kind.groups)
         else:
             defaults = {"defaults": [*kind.groups, "_self_"]} if kind.groups else {}
-            store("session", name, _defaults(kind.settings) | node | defaults)
+            store("session", name, node=_defaults(kind.settings) | node | defaults)
     for level, faults in LEVELS.items():
-        store("session/faults", level, settings_mapping(faults))
+        store("session/faults", level, node=settings_mapping(faults))
     rig = settings_mapping(Rig(name="", world=""))  # what a rig's file leaves out
     del rig["name"], rig["world"]
-    store("session/presets/rig", "default", rig)
+    store("session/presets/rig", "default", node=rig)
 
 
 def _defaults(settings: type) -> dict[str, Any]:
@@ -105,7 +109,7 @@ def _defaults(settings: type) -> dict[str, Any]:
     return found
 
 
-def _store_with_presets(
+def _store_with_presets(  # noqa: PLR0917
     group: str,
     name: str,
     settings: Callable[[str], Any],
@@ -118,13 +122,13 @@ def _store_with_presets(
     """
     with suppress(SettingError):  # of an installed method; who chooses it gets the message
         for preset in PRESETS:
-            store(f"{group}/presets/{name}", preset, settings_mapping(settings(preset)))
+            store(f"{group}/presets/{name}", preset, node=settings_mapping(settings(preset)))
         defaults = [{f"presets/{name}@_here_": "${preset}"}, *choices, "_self_"]
         node = {"defaults": defaults, **node}
-    store(group, name, node)
+    store(group, name, node=node)
 
 
-def store(group: str, name: str, node: dict[str, Any], package: str | None = None) -> None:
+def store(group: str, name: str, *, node: dict[str, Any], package: str | None = None) -> None:
     """Offer an option of a group; a command does so for the groups that it alone has."""
     ConfigStore.instance().store(name, node, group or None, package)
 

@@ -45,8 +45,8 @@ def command(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callab
             show_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1" or TRACEBACK in sys.argv
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them
             warnings.showwarning = print_warning
-            job = _Job(_importable(main), config_name, show_traceback)
-            _exit_on_error(job.start, config_name, show_traceback)
+            job = _Job(_importable(main), config_name, show_traceback=show_traceback)
+            _exit_on_error(job.start, config_name, show_traceback=show_traceback)
 
         program.main = main  # type: ignore[attr-defined]
         return program
@@ -76,7 +76,9 @@ class _Job:
         main = import_module(self.module).main.main
         if os.getpid() == self.process:
             # Caught here as well: Hydra would print a line of its own about a failed job.
-            _exit_on_error(lambda: main(config), self.config_name, self.show_traceback)
+            _exit_on_error(
+                lambda: main(config), self.config_name, show_traceback=self.show_traceback
+            )
         else:
             # Joblib's name for how it started this process says nothing to those started from it.
             multiprocessing.set_start_method("spawn", force=True)
@@ -122,7 +124,7 @@ def require_used(*keys: str, reason: str, accepted: str) -> None:
                 raise SettingError(f"{typed} has no effect: {reason}; accepted: {accepted}")
 
 
-def _exit_on_error(run: Callable[[], None], config_name: str, show_traceback: bool) -> None:
+def _exit_on_error(run: Callable[[], None], config_name: str, *, show_traceback: bool) -> None:
     try:
         run()
     except KeyboardInterrupt:
@@ -147,7 +149,9 @@ def error_message(error: BaseException, config_name: str) -> str:
         group, _, choice = error.missing_cfg_file.rpartition("/")
         if mesh := _mesh_as_object(error.missing_cfg_file):
             return f"object has no option {mesh!r}; accepted: object=mesh object.path={mesh}"
-        return _not_accepted(group, f"has no option {choice!r}", choice, list(error.options))
+        return _not_accepted(
+            group, f"has no option {choice!r}", value=choice, accepted=list(error.options)
+        )
     if isinstance(error, OverrideParseException):
         what = error.message.splitlines()[0]
         return f"{error.override!r} is not a setting ({what}); accepted: KEY=VALUE"
@@ -173,7 +177,9 @@ def _unknown_key(error: ConfigKeyError | ConfigAttributeError, config_name: str)
     node = error.parent_node or {}
     where = f"{where}={node['name']}" if where == "method" else where
     accepted = [str(known) for known in node if known != "hydra"]
-    return _not_accepted(where or config_name, f"has no key {name!r}", name, accepted)
+    return _not_accepted(
+        where or config_name, f"has no key {name!r}", value=name, accepted=accepted
+    )
 
 
 def _mesh_as_object(missing: str) -> str:
@@ -182,7 +188,7 @@ def _mesh_as_object(missing: str) -> str:
     return option if group == "object" and Path(option).suffix else ""
 
 
-def _not_accepted(where: str, what: str, value: str, accepted: list[str]) -> str:
+def _not_accepted(where: str, what: str, *, value: str, accepted: list[str]) -> str:
     close = difflib.get_close_matches(value, accepted, n=1, cutoff=0.5)
     hint = f"; did you mean {close[0]}?" if close else ";"
     return f"{where} {what}{hint} accepted: {', '.join(accepted) or 'no key below it'}"

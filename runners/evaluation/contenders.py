@@ -44,7 +44,7 @@ class Contender:
 
 
 def chosen_contenders(
-    methods: Any, settings: Mapping[str, Any], preset: str, draws: int = 1
+    methods: Any, settings: Mapping[str, Any], *, preset: str, draws: int = 1
 ) -> dict[str, Contender]:
     """Return, by label, the contenders of a list, or of "all", each so many times.
 
@@ -53,25 +53,27 @@ def chosen_contenders(
     by label, for all entries that these fit; an entry's own come last. preset: where an entry has
     none. Raise SettingError for what does not exist, and for a label that is taken.
     """
-    require_instance("settings", settings, Mapping, "a group of settings by method")
+    require_instance("settings", settings, kind=Mapping, accepted="a group of settings by method")
     require_repeats(draws)
-    entries = _entries("methods", methods, METHODS, LABELS_HELP)
+    entries = _entries("methods", methods, every=METHODS, accepted=LABELS_HELP)
     for key in settings:
-        require_choice("settings of a method", key, dict.fromkeys([*METHODS, *entries]))
+        require_choice("settings of a method", key, accepted=dict.fromkeys([*METHODS, *entries]))
     chosen: dict[str, Contender] = {}
     for label, entry in entries.items():
         own_preset = entry.preset or preset
         values = preset_settings(entry.name, own_preset)
         for key in dict.fromkeys([entry.name, label]):
-            values = changed_settings(values, settings.get(key) or {}, f"settings.{key}")
-        values = changed_settings(values, entry.settings or {}, f"methods: settings of {label}")
+            values = changed_settings(values, settings.get(key) or {}, where=f"settings.{key}")
+        values = changed_settings(
+            values, entry.settings or {}, where=f"methods: settings of {label}"
+        )
         made = settings_mapping(build_method(entry.name, values).settings)
         for draw in range(draws):
             name = repeat_label(label, draw)
             require_label(name)
             if name in chosen:
                 raise SettingError(f"methods has {name} twice; accepted: {LABELS_HELP}")
-            chosen[name] = Contender(entry.name, name, own_preset, made, draw)
+            chosen[name] = Contender(entry.name, name, preset=own_preset, settings=made, draw=draw)
     return chosen
 
 
@@ -84,17 +86,23 @@ def chosen_policies(policies: Any, settings: Mapping[str, Any]) -> dict[str, Con
     chosen: dict[str, Contender] = {}
     if policies is None:
         return chosen
-    for label, entry in _entries("policies", policies, POLICIES, _POLICIES_HELP).items():
+    for label, entry in _entries(
+        "policies", policies, every=POLICIES, accepted=_POLICIES_HELP
+    ).items():
         require_label(label)
         if entry.preset is not None:
             raise SettingError(f"policies has {label!r}; accepted: {_POLICIES_HELP}")
-        values = changed_settings(policy_settings(entry.name), settings, "policy")
-        values = changed_settings(values, entry.settings or {}, f"policies: settings of {label}")
+        values = changed_settings(policy_settings(entry.name), settings, where="policy")
+        values = changed_settings(
+            values, entry.settings or {}, where=f"policies: settings of {label}"
+        )
         chosen[label] = Contender(entry.name, label, settings=settings_mapping(values))
     return chosen
 
 
-def _entries(setting: str, value: Any, every: Iterable[str], accepted: str) -> dict[str, Contender]:
+def _entries(
+    setting: str, value: Any, *, every: Iterable[str], accepted: str
+) -> dict[str, Contender]:
     """Return the entries of a list of contenders by their labels."""
     if isinstance(value, str):
         value = list(every) if value == "all" else [text.strip() for text in value.split(",")]
@@ -104,9 +112,9 @@ def _entries(setting: str, value: Any, every: Iterable[str], accepted: str) -> d
     entries: dict[str, Contender] = {}
     for one in listed:
         if isinstance(one, Mapping):
-            entry = build_settings(Contender, one, setting)
+            entry = build_settings(Contender, one, where=setting)
         elif match := _LABEL.fullmatch(str(one)):
-            entry = Contender(match["name"], str(one), match["preset"])
+            entry = Contender(match["name"], str(one), preset=match["preset"])
         else:
             raise SettingError(f"{setting} has {one!r}; accepted: {accepted}")
         label = entry.label or entry.name

@@ -14,7 +14,6 @@ from typing import Any
 import pandas as pd
 import pyarrow as pa
 import pyarrow.csv
-import pyarrow.parquet
 from filelock import FileLock, Timeout
 
 from chsel.errors import RecordingError, SettingError
@@ -27,7 +26,10 @@ _MAY_GROW = ("methods", "outside", "policies")
 _MAY_DIFFER = {"name", "configurations", "seeds", "commands", "environments", *_MAY_GROW}
 _OF_MACHINE = {"folder", "assets", "recordings"}  # no result depends on these
 Row = Mapping[str, Any]
-_TEXT, _COUNT, _NUMBER, _FLAG = pa.string(), pa.int64(), pa.float64(), pa.bool_()
+_TEXT = pa.string()
+_COUNT = pa.int64()
+_NUMBER = pa.float64()
+_FLAG = pa.bool_()
 
 
 def _schema(*columns: tuple[pa.DataType, str]) -> pa.Schema:
@@ -95,7 +97,7 @@ TABLES = {"results": RESULTS, "iterations": ITERATIONS, "probes": PROBES}
 _ORDER = ("object", "configuration", "seed", "policy", "method", "step", "iteration")
 
 
-def write_part(path: Path, rows: Sequence[Row], schema: pa.Schema, source: str = "") -> None:
+def write_part(path: Path, rows: Sequence[Row], *, schema: pa.Schema, source: str = "") -> None:
     """Write a finished part of a table. source: kept with it, see `part_source`."""
     table = pa.Table.from_pylist([dict(row) for row in rows], schema=schema)
     with whole_file(path) as beside:
@@ -125,7 +127,7 @@ def collect(folder: Path) -> pa.Table:
     experiment = read_experiment(folder)
     searches = ["iterations"] if experiment["every"] is not None else []
     for name in [*searches, "probes" if experiment["policies"] else "results"]:
-        table = gathered(folder, experiment, name)
+        table = gathered(folder, experiment, name=name)
         with whole_file(folder / f"{name}.parquet") as beside:
             pa.parquet.write_table(table, beside)
         with whole_file(folder / f"{name}.csv") as beside:
@@ -133,7 +135,7 @@ def collect(folder: Path) -> pa.Table:
     return table
 
 
-def gathered(folder: Path, experiment: Mapping[str, Any], name: str) -> pa.Table:
+def gathered(folder: Path, experiment: Mapping[str, Any], *, name: str) -> pa.Table:
     """Return the rows of one of TABLES, in order, of the parts that are finished."""
     schema = TABLES[name]
     suffixes = (".iterations.parquet",) if name == "iterations" else (".parquet", ".failed.parquet")
@@ -152,17 +154,17 @@ def gathered(folder: Path, experiment: Mapping[str, Any], name: str) -> pa.Table
 
 
 def join_experiment(
-    plan: Plan, name: str, configurations: Sequence[str], seeds: Sequence[int]
+    plan: Plan, name: str, *, configurations: Sequence[str], seeds: Sequence[int]
 ) -> None:
     """Make the folder of an evaluation, or add configurations, seeds and methods to it.
 
     Raise SettingError, naming what differs, if it was made with other settings, or is another's.
     """
     path = plan.folder / FILE
-    ours = _described(plan, name, configurations, seeds)
+    ours = _described(plan, name, configurations=configurations, seeds=seeds)
     if path.exists():
         theirs = read_experiment(plan.folder)
-        _check_same(plan.folder, theirs, ours)
+        _check_same(plan.folder, theirs, ours=ours)
         ours |= {kind: {**theirs[kind], **ours[kind]} for kind in _MAY_GROW}
         both = {*theirs["configurations"], *configurations}
         ours["name"] = theirs["name"]
@@ -195,7 +197,7 @@ def read_experiment(folder: Path) -> dict[str, Any]:
 
 
 def _described(
-    plan: Plan, name: str, configurations: Sequence[str], seeds: Sequence[int]
+    plan: Plan, name: str, *, configurations: Sequence[str], seeds: Sequence[int]
 ) -> dict[str, Any]:
     values = {key: value for key, value in asdict(plan).items() if key not in _OF_MACHINE}
     values |= {"methods": values.pop("contenders"), "steered": bool(plan.policies)}
@@ -204,7 +206,7 @@ def _described(
     return dict(json.loads(json.dumps(values, default=str)))  # as it will be read
 
 
-def _check_same(folder: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
+def _check_same(folder: Path, theirs: Mapping[str, Any], *, ours: Mapping[str, Any]) -> None:
     """Raise SettingError where what may not become more differs."""
 
     def fixed(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:

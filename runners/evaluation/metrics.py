@@ -27,7 +27,7 @@ def definition_settings(definition: Mapping[str, Any], epsilon: float | None) ->
     values = {key: value for key, value in definition.items() if key != "name"}
     if values.get("epsilon") is None:
         values["epsilon"] = epsilon
-    return build_settings(PlausibleSettings, values, "definition")
+    return build_settings(PlausibleSettings, values, where="definition")
 
 
 def definition_label(definition: Mapping[str, Any]) -> str:
@@ -44,7 +44,8 @@ def definition_label(definition: Mapping[str, Any]) -> str:
 
 def definition_text(definition: Mapping[str, Any]) -> str:
     """Return the label of a definition, and which poses are members by it."""
-    cost, epsilon = definition_settings(definition, 1.0).cost, definition.get("epsilon")
+    cost = definition_settings(definition, 1.0).cost
+    epsilon = definition.get("epsilon")
     bound = "that of each object" if epsilon is None else f"{1000.0 * epsilon:g} mm"
     return (
         f"{definition_label(definition)}, cost by {_COMBINED[cost.combine]}, free points at most "
@@ -63,25 +64,27 @@ class MetricsConfig(DistanceSettings):
         cheapest(np.zeros(1), self.quantile)  # which checks it
 
 
-store("metrics", "default", settings_mapping(MetricsConfig()))
+store("metrics", "default", node=settings_mapping(MetricsConfig()))
 
 
 class HypothesisMetrics:
     """The metrics of hypotheses; the same points on the surface for all steps of a session."""
 
     def __init__(
-        self, config: MetricsConfig, mesh: trimesh.Trimesh, world_from_object: FloatArray
+        self, config: MetricsConfig, mesh: trimesh.Trimesh, *, world_from_object: FloatArray
     ) -> None:
         """Prepare the metrics. mesh: in metres. world_from_object (4, 4): the true pose."""
-        self._config, self._mesh, self._truth = config, mesh, world_from_object
+        self._config = config
+        self._mesh = mesh
+        self._truth = world_from_object
         self._distance: SurfaceDistance | None = None
 
     def compute(
         self,
         problem: RegistrationProblem,
         members: PlausibleSet,
-        found: Hypotheses | None,
         *,
+        found: Hypotheses | None,
         ranked: bool = True,
     ) -> dict[str, float]:
         """Return coverage, plausibility and diversity in mm^2, its root, and if wanted the rank."""
@@ -93,11 +96,11 @@ class HypothesisMetrics:
         names = ("coverage", "plausibility", "diversity", "root")
         row = {"distinct": found.distinct, **{name: getattr(metrics, name) for name in names}}
         if ranked and len(chosen) > 1:
-            row["rank"] = true_pose_rank(distance, chosen, self._truth)
+            row["rank"] = true_pose_rank(distance, chosen, world_from_object=self._truth)
         return row
 
     def nearest(
-        self, problem: RegistrationProblem, found: Hypotheses, truth: FloatArray
+        self, problem: RegistrationProblem, found: Hypotheses, *, truth: FloatArray
     ) -> tuple[int, float]:
         """Return the index of the hypothesis nearest to the truth (4, 4), and its RMS distance, m.
 
@@ -111,6 +114,8 @@ class HypothesisMetrics:
     def _surface_distance(self, problem: RegistrationProblem) -> SurfaceDistance:
         if self._distance is None:
             key = StreamKey(problem.key.seed, 0)
-            points = surface_points(self._mesh, self._config.points, key)
-            self._distance = SurfaceDistance(problem.sdf, self._mesh, points, self._config)
+            points = surface_points(self._mesh, self._config.points, key=key)
+            self._distance = SurfaceDistance(
+                problem.sdf, self._mesh, points=points, settings=self._config
+            )
         return self._distance

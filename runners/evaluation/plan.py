@@ -63,7 +63,7 @@ class Plan:
     policies: Mapping[str, Contender] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require_choice("session", self.kind, SESSIONS)
+        require_choice("session", self.kind, accepted=SESSIONS)
         if self.plausible and self.session.get("moves"):
             raise SettingError(
                 "plausible sets of an object that moves (session.moves); accepted: plausible=false"
@@ -113,7 +113,7 @@ class Plan:
         values = object_values(f"{OBJECTS[self.objects]}{of.object}")
         if self.kind == SENSORS:
             values |= {"scale": 1.0, "configuration": configuration}
-        return build_settings(ObjectConfig, values, "object")
+        return build_settings(ObjectConfig, values, where="object")
 
     def session_config(self, trial: Trial) -> dict[str, Any]:
         """Return the settings of the session of a trial, with its kind."""

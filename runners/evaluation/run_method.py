@@ -54,25 +54,26 @@ class ResultRows:
     """Makes rows of the table of what was found at the steps of a trial."""
 
     def __init__(
-        self, plan: Plan, trial: Trial, session: RecordedSource, label: str, holds: Any = None
+        self, plan: Plan, trial: Trial, *, session: RecordedSource, label: str, holds: Any = None
     ) -> None:
         """Measure a session with faults by the plausible sets of the same probes without any.
 
         holds: of the method that made the hypotheses, tells whether its set has the truth.
         """
         self._plan, self._trial = plan, trial
-        self._about, self._holds = plan.about(trial, label), holds
+        self._about = plan.about(trial, label)
+        self._holds = holds
         self._clean = trial.without_faults(plan)
         self._clean_problems: dict[int, RegistrationProblem] | None = None
         if self._clean != trial and plan.plausible:
-            of_clean = problems(plan, self._clean, open_recorded(plan, self._clean))
+            of_clean = problems(plan, self._clean, session=open_recorded(plan, self._clean))
             self._clean_problems = {problem.key.step: problem for problem in of_clean}
         self._missing: dict[str, str] = {}  # why steps have no plausible set
         if plan.plausible:
             self._missing = read_told(self._clean.folder(plan))["no_plausible_set"]
         self._settings = plausible_settings_of(plan, session)
         mesh, self._session = session.recorded.mesh, session
-        self._metrics = HypothesisMetrics(plan.metrics, mesh, self._truth)
+        self._metrics = HypothesisMetrics(plan.metrics, mesh, world_from_object=self._truth)
         self._symmetry = object_symmetry(mesh)
 
     @property
@@ -90,16 +91,18 @@ class ResultRows:
             return None, f"without faults there is no registration at step {step}"
         if str(step) in self._missing:
             return None, self._missing[str(step)]
-        folder, of_session = self._clean.folder(self._plan), self._of_session(problem)
+        folder = self._clean.folder(self._plan)
+        of_session = self._of_session(problem)
         truth = {"world_from_object": self._truth}
-        found = load_plausible(folder / "plausible", of_session, self._settings, **truth)
+        found = load_plausible(folder / "plausible", of_session, settings=self._settings, **truth)
         return found, "" if found else f"no file in {folder.name}/plausible; remove session.json"
 
     def row(
-        self, problem: RegistrationProblem, found: Hypotheses | None, failure: str = ""
+        self, problem: RegistrationProblem, found: Hypotheses | None, *, failure: str = ""
     ) -> dict[str, Any]:
         """Return the row of a step. found: None if the registration failed. failure: why."""
-        points, (members, missing) = problem.points, self.members(problem)
+        points = problem.points
+        (members, missing) = self.members(problem)
         row: dict[str, Any] = {
             **self._about,
             "step": problem.key.step,
@@ -126,9 +129,9 @@ class ResultRows:
         if len(found.cost) == 0:
             return row
         of_session = self._of_session(problem)
-        nearest, distance = self._metrics.nearest(of_session, found, self._truth)
+        nearest, distance = self._metrics.nearest(of_session, found, truth=self._truth)
         chosen = found.object_from_world[[0, nearest]]
-        position, rotation = pose_errors(chosen, self._truth, self._symmetry)
+        position, rotation = pose_errors(chosen, self._truth, symmetry=self._symmetry)
         row |= {
             "best_cost": float(found.cost[0]),
             "mean_cost": float(found.cost.mean()),
@@ -146,7 +149,7 @@ class ResultRows:
         cost = EvaluationCost(of_session, self._settings.cost)
         below = cost.evaluate(found.object_from_world, limit=limit) < limit
         row["exact_members"] = float(below.mean())
-        return row | self._metrics.compute(of_session, members, found)
+        return row | self._metrics.compute(of_session, members, found=found)
 
     def _of_session(self, problem: RegistrationProblem) -> RegistrationProblem:
         """Return the problem without faults, with the same random numbers for all draws."""
@@ -155,15 +158,17 @@ class ResultRows:
         return replace(problem, key=StreamKey(self._trial.seed, problem.key.step))
 
     def iterations(
-        self, problem: RegistrationProblem, snapshots: Sequence[ArchiveSnapshot], settings: Any
+        self, problem: RegistrationProblem, snapshots: Sequence[ArchiveSnapshot], *, settings: Any
     ) -> Iterator[Row]:
         """Yield the rows of a step's search, of a method with these settings."""
         members, _ = self.members(problem)
         if members is None:
             return
         for snapshot in snapshots:
-            found = hypotheses_of(snapshot, problem, settings)
-            metrics = self._metrics.compute(self._of_session(problem), members, found, ranked=False)
+            found = hypotheses_of(snapshot, problem, settings=settings)
+            metrics = self._metrics.compute(
+                self._of_session(problem), members, found=found, ranked=False
+            )
             yield {
                 **self._about,
                 "step": problem.key.step,
@@ -177,21 +182,27 @@ class ResultRows:
 
 
 def hypotheses_of(
-    snapshot: ArchiveSnapshot, problem: RegistrationProblem, settings: Any
+    snapshot: ArchiveSnapshot, problem: RegistrationProblem, *, settings: Any
 ) -> Hypotheses:
     """Return the cells with the |E_0| lowest costs, chosen as the method with the settings does."""
     space = search_space(settings.plane, problem.sdf)
     stream = problem.key.stream(Purpose.RESAMPLE, snapshot.refinement)
-    costs, poses = -snapshot.objectives, space.poses(snapshot.solutions)
-    chosen = select_elites(costs, poses, problem, space, settings.output, stream)
-    return ranked(poses[chosen].matrices, costs[chosen], snapshot.cells[chosen], poses.matrices)
+    costs = -snapshot.objectives
+    poses = space.poses(snapshot.solutions)
+    chosen = select_elites(
+        costs, poses, problem=problem, space=space, settings=settings.output, stream=stream
+    )
+    return ranked(
+        poses[chosen].matrices, costs[chosen], cells=snapshot.cells[chosen], elites=poses.matrices
+    )
 
 
 def method_rows(
-    plan: Plan, trial: Trial, contender: Contender, recorder: StepRecorder
+    plan: Plan, trial: Trial, *, contender: Contender, recorder: StepRecorder
 ) -> list[Row]:
     """Return a row for every registration; write those of searches, where wanted."""
-    session, chosen = open_recorded(plan, trial), plan.steps_of(trial.configuration)
+    session = open_recorded(plan, trial)
+    chosen = plan.steps_of(trial.configuration)
     method, leader = contender.method(), plan.leader()
     warm_up(method)  # so that no time holds the loading of compiled kernels
     config = {"name": contender.name, **contender.settings}
@@ -214,22 +225,24 @@ def method_rows(
         run.begin(started, seed=repeat_seed(trial.seed, contender.draw), settings=leader.online)
         walked = steps(run, session, register=partial(_lead, leader=leader, chosen=chosen))
     holds = getattr(method, "holds", None)
-    result_rows = ResultRows(plan, trial, session, contender.label, holds)
+    result_rows = ResultRows(plan, trial, session=session, label=contender.label, holds=holds)
     rows, iterations = list[Row](), list[Row]()
     for _ in walked:
         problem = run.problem
         if problem is None or run.step not in chosen:
             continue
         if run.registered is None:
-            rows.append(result_rows.row(problem, None, run.failure))
+            rows.append(result_rows.row(problem, None, failure=run.failure))
             continue
         row = result_rows.row(problem, run.registered.hypotheses)
         rows.append(row | {"seconds": run.registered.total_seconds})
         if plan.every is not None:
-            iterations += result_rows.iterations(problem, recorder.snapshots, method.settings)
+            iterations += result_rows.iterations(
+                problem, recorder.snapshots, settings=method.settings
+            )
     if plan.every is not None:
         path = trial.folder(plan) / f"{contender.label}.iterations.parquet"
-        write_part(path, iterations, ITERATIONS)
+        write_part(path, iterations, schema=ITERATIONS)
     return rows
 
 
@@ -260,27 +273,27 @@ def external_folders(given: Mapping[str, Path]) -> dict[str, Path]:
     return found
 
 
-def external_file(plan: Plan, trial: Trial, label: str) -> Path:
+def external_file(plan: Plan, trial: Trial, *, label: str) -> Path:
     """FOLDER/CONFIGURATION/seed_S.npz, or .json if there is that alone."""
     path = plan.outside[label] / trial.configuration / f"seed_{trial.seed}.npz"
     text = path.with_suffix(".json")
     return text if text.is_file() and not path.is_file() else path
 
 
-def external_digest(plan: Plan, trial: Trial, label: str) -> str:
+def external_digest(plan: Plan, trial: Trial, *, label: str) -> str:
     """Digest of the file of a trial; "none" without one."""
-    path = external_file(plan, trial, label)
+    path = external_file(plan, trial, label=label)
     return file_digest(path) if path.is_file() else "none"
 
 
-def read_external(plan: Plan, trial: Trial, label: str) -> dict[int, dict[str, Any]]:
+def read_external(plan: Plan, trial: Trial, *, label: str) -> dict[int, dict[str, Any]]:
     """Return the sets of a trial in the folder of a label, by step; none without a file.
 
     npz: arrays `step_K` (B, 4, 4), world_from_object of step K, best first; where known `cost_K`
     (B,) and `seconds_K`. json: the same as lists. Given as "step", "cost" and "seconds". Raises
     ExternalSetError for other names, steps that do not exist, shapes, numbers and rotations.
     """
-    path = external_file(plan, trial, label)
+    path = external_file(plan, trial, label=label)
     if not path.is_file():
         return {}
     try:
@@ -302,34 +315,38 @@ def read_external(plan: Plan, trial: Trial, label: str) -> dict[int, dict[str, A
             raise ExternalSetError(
                 f"{path} has {key}; accepted: steps 0 to {steps[-1]} of {trial.configuration}"
             )
-        array = frozen(f"{path}: {key}", value, _SHAPES[match[1]], error=ExternalSetError)
+        array = frozen(f"{path}: {key}", value, shape=_SHAPES[match[1]], error=ExternalSetError)
         sets.setdefault(step, {})[match[1]] = array
     for step, found in sets.items():
-        name, poses = f"{path}: step_{step}", found.get("step", ())
+        name = f"{path}: step_{step}"
+        poses = found.get("step", ())
         if len(poses) == 0:
             raise ExternalSetError(f"{name} is empty; accepted: at least one transform")
-        check_rigid(name, poses, _TOLERANCE)
+        check_rigid(name, poses, tolerance=_TOLERANCE)
         if len(found.get("cost", poses)) != len(poses):
             raise ExternalSetError(f"{path}: cost_{step} is not as long as step_{step}")
     return sets
 
 
-def external_rows(plan: Plan, trial: Trial, label: str) -> list[Row]:
+def external_rows(plan: Plan, trial: Trial, *, label: str) -> list[Row]:
     """Return the rows of the table about external results, of one trial."""
-    sets, path = read_external(plan, trial, label), external_file(plan, trial, label)
+    sets, path = read_external(plan, trial, label=label), external_file(plan, trial, label=label)
     missing = f"{path} has no set of this step" if path.is_file() else f"there is no {path}"
     session = open_recorded(plan, trial)
-    result_rows = ResultRows(plan, trial, session, label)
+    result_rows = ResultRows(plan, trial, session=session, label=label)
     rows: list[Row] = []
-    for problem in problems(plan, trial, session):
+    for problem in problems(plan, trial, session=session):
         given = sets.get(problem.key.step)
         if given is None:
-            row = result_rows.row(problem, None, missing)
+            row = result_rows.row(problem, None, failure=missing)
         else:
             cost = given.get("cost", np.zeros(len(given["step"])))
             order = np.argsort(cost, kind="stable")
-            poses, cells = inverse(given["step"])[order], np.full(len(cost), -1, dtype=np.int64)
-            found = Hypotheses(poses, cost[order], repeated(Poses.of(poses)), cells, poses)
+            poses = inverse(given["step"])[order]
+            cells = np.full(len(cost), -1, dtype=np.int64)
+            found = Hypotheses(
+                poses, cost[order], duplicate=repeated(Poses.of(poses)), cell=cells, elites=poses
+            )
             row = result_rows.row(problem, found)
             row["seconds"] = float(given["seconds"]) if "seconds" in given else None
             if "cost" not in given:

@@ -33,17 +33,21 @@ _WIDEST = 3  # directions
 
 
 def policy_rows(
-    plan: Plan, trial: Trial, contender: Contender, recorder: StepRecorder
+    plan: Plan, trial: Trial, *, contender: Contender, recorder: StepRecorder
 ) -> list[Row]:
     """Return a row for every probe of a session as `runners.probe` has it, within the budget."""
     (registering,) = plan.contenders.values()
     method, policy = registering.method(), contender.policy()
     warm_up(method)  # so that no time holds the loading of compiled kernels
     warm_up_policy(policy)
-    config, settings = probe_config(plan, trial, contender), policy.settings
-    setup, rows = open_setup(config), list[Row]()
+    config = probe_config(plan, trial, policy=contender)
+    settings = policy.settings
+    setup = open_setup(config)
+    rows = list[Row]()
     try:
-        started = session_started(config, config_values(config), registering.name, setup)
+        started = session_started(
+            config, config_values(config), method_name=registering.name, setup=setup
+        )
         run = Run(
             method,
             recorder,
@@ -72,7 +76,7 @@ def _row(
 
     def errors(poses: FloatArray) -> FloatArray:
         """Return how far the surface in poses (B, 4, 4), object_from_world, is off (B,), metres."""
-        return surface.outline_distances_to(setup.sdf, Poses.of(poses), truth)
+        return surface.outline_distances_to(setup.sdf, Poses.of(poses), other=truth)
 
     after = run.loop.state.decided
     found = run.loop.state.previous
@@ -142,8 +146,9 @@ def belief_numbers(
 ) -> Row:
     """Return how far a belief is right about the true pose (4, 4), and about grasps."""
     symmetry = object_symmetry(mesh)
-    truth, members = inverse(world_from_object), belief.object_from_world
-    off = pose_offsets(symmetry, members[0], np.concatenate([truth[None], members]))
+    truth = inverse(world_from_object)
+    members = belief.object_from_world
+    off = pose_offsets(symmetry, members[0], others=np.concatenate([truth[None], members]))
     off[:, 3:] *= 0.25 * sdf.diameter  # metres
     off -= off[1:].mean(axis=0)
     directions = np.linalg.eigh(off[1:].T @ off[1:])[1][:, -_WIDEST:]
@@ -153,14 +158,20 @@ def belief_numbers(
         lower, upper = np.quantile(along, [first, 1.0 - first], axis=0)
         row[name] = float(((lower <= true) & (true <= upper)).mean())
     stream = key.stream(Purpose.GRASPS)
-    drawn = inverse(members[uniforms(stream, 0, len(members), _GRASPS).astype(int)])
+    drawn = inverse(members[uniforms(stream, 0, upper=len(members), shape=_GRASPS).astype(int)])
     lower, upper = mesh.bounds
-    held = rotated(drawn[:, :3, :3], uniforms(stream, lower, upper, (_GRASPS, 3))) + drawn[:, :3, 3]
-    grasps, gripper = compose(random_rotations(stream, _GRASPS), held), Gripper()
+    held = (
+        rotated(drawn[:, :3, :3], uniforms(stream, lower, upper=upper, shape=(_GRASPS, 3)))
+        + drawn[:, :3, 3]
+    )
+    grasps = compose(random_rotations(stream, _GRASPS), held)
+    gripper = Gripper()
     chance = belief.grasp_chance(grasps, gripper.opening).chance
     best = int(np.argmax(chance))
     there = Poses.of(truth[None])
-    works = grasps_work(sdf, there, grasps[[best]], gripper.opening, gripper)
+    works = grasps_work(
+        sdf, there, world_from_gripper=grasps[[best]], width=gripper.opening, gripper=gripper
+    )
     return row | {"grasp_chance": float(chance[best]), "grasp_works": bool(works[0, 0])}
 
 
@@ -182,6 +193,6 @@ def usual_stop(spread: float, promised: float | None, *, diameter: float, verdic
     spread, promised: of the belief and by the best action, metres. diameter: of the object.
     """
     rules = StopSettings()
-    if rules.is_narrow(spread, diameter, verdict):
+    if rules.is_narrow(spread, diameter, verdict=verdict):
         return "spread"
     return "gain" if promised is not None and rules.is_useless(promised, diameter) else ""

@@ -115,33 +115,37 @@ def tasks_of(plan: Plan, trials: Sequence[Trial]) -> list[Task]:
 def is_finished(plan: Plan, task: Task) -> bool:
     """Return whether the task's last file is there; external results may have changed since."""
     if task.label in plan.outside:
-        digest = external_digest(plan, task.trial, task.label)
+        digest = external_digest(plan, task.trial, label=task.label)
         return part_source(task.finished(plan)) == digest
     return task.finished(plan).exists()
 
 
 def do_task(plan: Plan, task: Task) -> None:
     """Do a task, on one thread: its files are in the plan's folder when it ends."""
-    folder, label, source = task.trial.folder(plan), task.label, ""
+    folder = task.trial.folder(plan)
+    label = task.label
+    source = ""
     folder.mkdir(parents=True, exist_ok=True)
     with threads(1):
         if not label:
             make_session(plan, task.trial)
             return
         if label in plan.outside:
-            source = external_digest(plan, task.trial, label)
-            rows = external_rows(plan, task.trial, label)
+            source = external_digest(plan, task.trial, label=label)
+            rows = external_rows(plan, task.trial, label=label)
         else:
             contender = {**plan.contenders, **plan.policies}[label]
             rows_of = policy_rows if plan.policies else method_rows
             with recording_in(folder / f"{label}.mcap" if plan.recordings else None) as recorder:
-                rows = rows_of(plan, task.trial, contender, recorder)
-    write_part(task.finished(plan), rows, PROBES if plan.policies else RESULTS, source)
+                rows = rows_of(plan, task.trial, contender=contender, recorder=recorder)
+    write_part(
+        task.finished(plan), rows, schema=PROBES if plan.policies else RESULTS, source=source
+    )
     task.failed(plan).unlink(missing_ok=True)
 
 
 def do_tasks(
-    plan: Plan, tasks: Sequence[Task], client: Client, workers: int
+    plan: Plan, tasks: Sequence[Task], *, client: Client, workers: int
 ) -> Iterator[tuple[Task, str]]:
     """Do tasks on Dask's workers, sessions first; yields each when it has ended, with its failure.
 
@@ -153,7 +157,7 @@ def do_tasks(
     for stage in ([t for t in tasks if not t.label], [t for t in tasks if t.label]):
         reasons = {task: [failed[t] for t in task.sessions(plan) if t in failed] for task in stage}
         for task in [task for task in stage if reasons[task]]:
-            yield task, _note(plan, task, f"session: {reasons[task][0]}")
+            yield task, _note(plan, task, failure=f"session: {reasons[task][0]}")
         waiting = iter([task for task in stage if not reasons[task]])
         running: dict[Future, Task] = {}
         while True:
@@ -162,10 +166,11 @@ def do_tasks(
             if not running:
                 break
             for future in wait(list(running), return_when="FIRST_COMPLETED").done:
-                task, failure = running.pop(future), _failure(future)
+                task = running.pop(future)
+                failure = _failure(future)
                 if failure and not task.label:
                     failed[task.trial] = failure
-                yield task, _note(plan, task, failure)
+                yield task, _note(plan, task, failure=failure)
 
 
 def _failure(future: Future) -> str:
@@ -180,14 +185,14 @@ def _failure(future: Future) -> str:
     return "" if error is None else one_line(error)
 
 
-def _note(plan: Plan, task: Task, failure: str) -> str:
+def _note(plan: Plan, task: Task, *, failure: str) -> str:
     """Make a failure a part of the table: a row a step, or one if there is no session's steps."""
     if failure and task.label:
         row = {**plan.about(task.trial, task.label), "status": f"failed: {failure}"}
         notes = task.trial.folder(plan) / "session.json"
         steps = read_told(notes.parent)["steps"] if notes.exists() and not plan.policies else [None]
         rows = [{**row, "step": step} for step in steps]
-        write_part(task.failed(plan), rows, PROBES if plan.policies else RESULTS)
+        write_part(task.failed(plan), rows, schema=PROBES if plan.policies else RESULTS)
     return failure
 
 

@@ -49,7 +49,8 @@ def configurations_of(kind: str, logs: Path | None = None) -> dict[str, TrialCon
     """
     known = CABINET_CONFIGURATIONS if kind == SENSORS else CONFIGURATIONS
     simulated = {
-        name: TrialConfiguration(name, one.object, len(one.grid)) for name, one in known.items()
+        name: TrialConfiguration(name, one.object, probes=len(one.grid))
+        for name, one in known.items()
     }
     if kind != SENSORS:
         return {
@@ -77,7 +78,7 @@ def faulty_name(configuration: str, level: str) -> str:
 
 def object_values(name: str) -> dict[str, Any]:
     """Return the values of the choice object=NAME."""
-    require_choice("object", name, sorted(OBJECTS))
+    require_choice("object", name, accepted=sorted(OBJECTS))
     return settings_mapping(OBJECTS[name])
 
 
@@ -96,14 +97,14 @@ def recorded_object(configuration: TrialConfiguration) -> ObjectConfig:
     values |= {**given, "name": values.get("name", name)}
     if values.get("path") is not None:
         values["path"] = str(file.parent / Path(str(values["path"])).expanduser())
-    return build_settings(ObjectConfig, values, str(file))
+    return build_settings(ObjectConfig, values, where=str(file))
 
 
 def _recorded(name: str, folder: Path) -> TrialConfiguration:
     given = _object_file(folder / OBJECT_FILE)["name"]
     if not isinstance(given, str):
         raise SettingError(f"{folder / OBJECT_FILE} has no name; {_ACCEPTED}")
-    return TrialConfiguration(name, given.rpartition("/")[2], None, folder)
+    return TrialConfiguration(name, given.rpartition("/")[2], probes=None, log_folder=folder)
 
 
 def _object_file(path: Path) -> Mapping[str, Any]:
@@ -114,13 +115,14 @@ def _object_file(path: Path) -> Mapping[str, Any]:
 
 
 def chosen_names(
-    setting: str, value: Any, existing: Iterable[str], objects: Mapping[str, str] | None = None
+    setting: str, value: Any, *, existing: Iterable[str], objects: Mapping[str, str] | None = None
 ) -> tuple[str, ...]:
     """Return the existing names that a setting chooses, in the order of all of them.
 
     A name, an object, a pattern such as noise_*, "all", or a list of these. objects: by name.
     """
-    names, chosen = list(existing), set()
+    names = list(existing)
+    chosen = set()
     for text in map(str, _listed(setting, value)):
         named = names if text == "all" else [name for name in names if name == text]
         named = named or [name for name in names if (objects or {}).get(name) == text]

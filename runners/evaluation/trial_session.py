@@ -79,14 +79,14 @@ def recording_in(path: Path | None) -> Iterator[StepRecorder]:
         try:
             recorder = StepRecorder(file)
             yield recorder
-            recorder.record(Logged(recorder.step, "info", "session finished"))
+            recorder.record(Logged(recorder.step, "info", text="session finished"))
             recorder.record(SessionEnded(recorder.step, "finished"))
             recorder.flush()
         finally:
             file.close()
 
 
-def probe_config(plan: Plan, trial: Trial, policy: Contender | None = None) -> ProbeConfig:
+def probe_config(plan: Plan, trial: Trial, *, policy: Contender | None = None) -> ProbeConfig:
     """Return the configuration of `runners.probe` for the probes of a trial."""
     first = next(iter(plan.contenders.values()), None)
     return ProbeConfig(
@@ -110,24 +110,28 @@ def config_values(config: ProbeConfig) -> dict[str, Any]:
     return {name: vars(v) if is_dataclass(v) else v for name, v in vars(config).items()}
 
 
-def record_session(plan: Plan, trial: Trial, recorder: Recorder) -> None:
+def record_session(plan: Plan, trial: Trial, *, recorder: Recorder) -> None:
     """Probe, or read the trial's raw log, and write it all down; of a log with its true pose."""
     log = ensure_log(plan, trial) if plan.kind == SENSORS else None
     config = probe_config(plan, trial)
     setup, values = open_setup(config), config_values(config)
-    session, values["session"] = setup.source, dict(values["session"])
+    session = setup.source
+    values["session"] = dict(values["session"])
     values.pop("method")
     try:
         for warning in setup.warnings:
             warnings.warn(warning, stacklevel=2)
-        truth, events = session.world_from_object, list(session.probes())
+        truth = session.world_from_object
+        events = list(session.probes())
         if log is not None:  # found with what is known at the end
-            found = ProbedProblems(events, session, setup.sdf, trial.seed)
+            found = ProbedProblems(events, session, sdf=setup.sdf, seed=trial.seed)
             at_end = found.problem(max(found.steps, default=0))
             guess, known = guessed_pose(log), simulated_truth(log)
-            truth, values[TRUTH] = sought_pose(at_end, setup.mesh, guess, plan.truth, known)
+            truth, values[TRUTH] = sought_pose(
+                at_end, setup.mesh, guess=guess, settings=plan.truth, truth=known
+            )
             values["session"] |= {"path": f"{trial.configuration}/{log.name}"}
-        started = session_started(config, values, "none", setup)
+        started = session_started(config, values, method_name="none", setup=setup)
         recorder.record(replace(started, runner="evaluate", world_from_object=truth, start=None))
         for event in events:
             recorder.record(event)
@@ -142,16 +146,17 @@ def make_session(plan: Plan, trial: Trial) -> None:
     folder, clean = trial.folder(plan), trial.without_faults(plan)
     if not (folder / "session.mcap").exists():
         with recording_in(folder / "session.mcap") as recorder:
-            record_session(plan, trial, recorder)
+            record_session(plan, trial, recorder=recorder)
     session = open_recorded(plan, trial)
-    settings, truth = plausible_settings_of(plan, session), session.world_from_object
+    settings = plausible_settings_of(plan, session)
+    truth = session.world_from_object
     assert truth is not None
     steps, failures = [], {}
-    for problem in problems(plan, trial, session):
+    for problem in problems(plan, trial, session=session):
         steps.append(problem.key.step)
         if clean == trial and plan.plausible:
             try:
-                made_set(folder / "plausible", problem, truth, settings)
+                made_set(folder / "plausible", problem, truth=truth, settings=settings)
             except EvaluationError as error:
                 failures[str(problem.key.step)] = " ".join(str(error).split())
     notes: dict[str, Any] = {"steps": steps, "no_plausible_set": failures}
@@ -168,9 +173,11 @@ def read_told(folder: Path) -> dict[str, Any]:
 
 def open_recorded(plan: Plan, trial: Trial) -> RecordedSource:
     """Return the session of a trial, from its recording."""
-    path, settings = trial.folder(plan) / "session.mcap", plan.session_settings(trial)
-    start = settings.start_contacts, settings.start_probe
-    return RecordedSource(RecordedSettings(str(path), *start))
+    path = trial.folder(plan) / "session.mcap"
+    settings = plan.session_settings(trial)
+    return RecordedSource(
+        RecordedSettings(str(path), settings.start_contacts, start_probe=settings.start_probe)
+    )
 
 
 def plausible_settings_of(plan: Plan, session: RecordedSource) -> PlausibleSettings:
@@ -180,7 +187,7 @@ def plausible_settings_of(plan: Plan, session: RecordedSource) -> PlausibleSetti
 
 
 def problems(
-    plan: Plan, trial: Trial, session: RecordedSource, settings: OnlineSettings = _ONE
+    plan: Plan, trial: Trial, *, session: RecordedSource, settings: OnlineSettings = _ONE
 ) -> Iterator[RegistrationProblem]:
     """Yield the problem of every step with a registration; none follows from a result."""
     loop = session.loop(settings, seed=trial.seed, steps=plan.steps_of(trial.configuration))
@@ -190,14 +197,15 @@ def problems(
 def made_set(
     folder: Path,
     problem: RegistrationProblem,
+    *,
     truth: FloatArray,
     settings: PlausibleSettings,
 ) -> tuple[PlausibleSet, bool]:
     """Return the set of a step, and whether it was there."""
-    found = sets.load_plausible(folder, problem, settings, world_from_object=truth)
+    found = sets.load_plausible(folder, problem, settings=settings, world_from_object=truth)
     if found is not None:
         return found, True
-    found = sets.plausible_set(problem, truth, settings)
+    found = sets.plausible_set(problem, truth, settings=settings)
     try:
         sets.save_plausible(folder, found)
     except EvaluationError as error:

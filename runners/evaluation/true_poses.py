@@ -68,13 +68,14 @@ class SourceConfig(CheckedSettings):
             reason = f"the recording {self.path} brings its own object and points"
             require_used("object", "session", "session/rig", reason=reason, accepted=accepted)
         return open_problem_file(
-            self.path, self.object, self.session, self.assets.folder, self.seed
+            self.path, self.object, session=self.session, assets=self.assets.folder, seed=self.seed
         )
 
 
 def sought_pose(
     problem: RegistrationProblem,
     mesh: trimesh.Trimesh,
+    *,
     guess: FloatArray,
     settings: TruePoseSettings,
     truth: FloatArray | None = None,
@@ -87,16 +88,17 @@ def sought_pose(
     """
     if len(problem.points.known) == 0:
         raise SessionError("there is no contact; accepted: a session that touched the object")
-    found, symmetry = find_true_pose(problem, guess, settings), object_symmetry(mesh)
+    found = find_true_pose(problem, guess, settings=settings)
+    symmetry = object_symmetry(mesh)
     pose = found.world_from_object
 
     def apart(other: FloatArray) -> dict[str, float]:
-        position, rotation = pose_errors(inverse(pose)[None], other, symmetry)
+        position, rotation = pose_errors(inverse(pose)[None], other, symmetry=symmetry)
         return {"position": float(position[0]), "rotation": float(rotation[0])}
 
     numbers: dict[str, Any] = {
         "cost": found.cost,
-        **fit(problem, pose, settings),
+        **fit(problem, pose, settings=settings),
         "guess": guess.tolist(),
         "guess_cost": found.guess_cost,
         "from_guess": apart(guess),
@@ -107,7 +109,7 @@ def sought_pose(
 
 
 def fit(
-    problem: RegistrationProblem, world_from_object: FloatArray, settings: TruePoseSettings
+    problem: RegistrationProblem, world_from_object: FloatArray, *, settings: TruePoseSettings
 ) -> dict[str, Any]:
     """Return how well a pose (4, 4) fits the known points.
 
@@ -160,10 +162,12 @@ def ensure_log(plan: Plan, trial: Trial) -> Path:
     log.parent.mkdir(parents=True, exist_ok=True)
     model = load_object(plan.object_config(trial.configuration), plan.assets)
     configuration = CABINET_CONFIGURATIONS[trial.configuration]
-    made = simulate_log(log, configuration, model.mesh, trial.seed, RobotSettings())
+    made = simulate_log(
+        log, configuration, mesh=model.mesh, seed=trial.seed, settings=RobotSettings()
+    )
     about = {"object": model.name, "scale": model.scale, "configuration": trial.configuration}
     about |= {"seed": trial.seed}
-    write_pose(_truth_path(log), made.world_from_object, about, overwrite=True)
+    write_pose(_truth_path(log), made.world_from_object, about=about, overwrite=True)
     return log
 
 

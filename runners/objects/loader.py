@@ -107,7 +107,8 @@ class ObjectModel:
 
     def grid(self, settings: GridSettings) -> SdfGrid:
         """Return the signed distance grid that settings ask for, made once."""
-        resolution, padding = self.resolution(settings), settings.object_padding
+        resolution = self.resolution(settings)
+        padding = settings.object_padding
         if (resolution, padding) not in self._grids:
             grid = object_grid(self.mesh, resolution, padding=padding)
             self._grids[resolution, padding] = grid
@@ -164,5 +165,5 @@ def check_size(model: ObjectModel, workspace: Workspace) -> list[MeshWarning]:
 
 def load_model(name: str, scale: float = 1.0) -> trimesh.Trimesh:
     """Return one of MODELS in the frame of its YCB mesh; metres at scale 1."""
-    require_choice("object.name", name, MODELS)
+    require_choice("object.name", name, accepted=MODELS)
     return load_mesh(Path(__file__).parent / "models" / f"{name}.ply", scale=scale)

@@ -80,7 +80,8 @@ def download_scan(scan: str, assets: AssetsConfig) -> str:
     import pooch
 
     pooch.get_logger().setLevel("ERROR")
-    url, folder = assets.archive_url(scan), scan_folder(assets.folder, scan)
+    url = assets.archive_url(scan)
+    folder = scan_folder(assets.folder, scan)
     assets.folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=assets.folder, prefix=".download_") as temporary:
         downloader = pooch.HTTPDownloader(timeout=TIMEOUT)
@@ -89,7 +90,8 @@ def download_scan(scan: str, assets: AssetsConfig) -> str:
         except OSError as error:
             reason = " ".join(str(error).split())
             raise DownloadError(f"{url} cannot be downloaded ({reason}); try again") from None
-        path, wanted = Path(temporary) / MESH_FILE, Path(scan, RESOLUTION, MESH_FILE)
+        path = Path(temporary) / MESH_FILE
+        wanted = Path(scan, RESOLUTION, MESH_FILE)
         try:
             with tarfile.open(archive, "r:gz") as tar:
                 found = [one for one in tar if Path(one.name) == wanted and one.isfile()]

@@ -38,7 +38,7 @@ class PackageConfig:
     pip: tuple[str, ...] = ()  # more arguments for pip, such as "--index-url=URL"
 
 
-store("package", "default", settings_mapping(PackageConfig()))
+store("package", "default", node=settings_mapping(PackageConfig()))
 
 
 def interpreter(config: PackageConfig, say: Callable[[str], None]) -> Path:

@@ -71,7 +71,8 @@ class Worker:
         """Read a problem, and build the package's signed distance grid from it."""
         with np.load(problem) as data:
             self._data = dict(data)
-        origin, shape = self._data["sdf_origin"], self._data["sdf_values"].shape
+        origin = self._data["sdf_origin"]
+        shape = self._data["sdf_values"].shape
         self._resolution = float(self._data["sdf_resolution"])
         last = origin + (np.array(shape) - 1) * self._resolution
         with tempfile.TemporaryDirectory(dir=self._folder) as folder:  # never read again
@@ -86,13 +87,14 @@ class Worker:
         classes = {"free": kinds.FREE, "known": kinds.SURFACE, "occupied": kinds.OCCUPIED}
         points = [self._data[name] for name in classes]
         self._positions = torch.tensor(np.concatenate(points), dtype=torch.float32)
-        numbers, counts = [kind.value for kind in classes.values()], [len(p) for p in points]
+        numbers = [kind.value for kind in classes.values()]
+        counts = [len(p) for p in points]
         self._semantics = torch.tensor(np.repeat(numbers, counts))
         self._initial_set = torch.tensor(self._data["initial_set"], dtype=torch.float32)
         return {}
 
     def register(
-        self, seed: int, cost: str = "", restarts: int = 0, steps: int = 0, search: int = 0
+        self, seed: int, cost: str = "", *, restarts: int = 0, steps: int = 0, search: int = 0
     ) -> dict[str, Any]:
         """Return construct and register once, with the package's own settings where none are given.
 
@@ -153,7 +155,7 @@ def _counting(cost: Any) -> Any:
     class Counting(cost):
         gradients = 0
 
-        def __call__(self, R: Any, T: Any, s: Any, other_info: Any = None) -> Any:
+        def __call__(self, R: Any, T: Any, s: Any, other_info: Any = None) -> Any:  # noqa: PLR0917
             Counting.gradients += bool(R.requires_grad)
             return super().__call__(R, T, s, other_info)
 

@@ -67,20 +67,21 @@ def last_half(rows: pd.DataFrame) -> pd.DataFrame:
 def open_evaluation(folder: Path) -> Evaluation:
     """Read the tables of a folder; of an evaluation that has none yet, what is finished."""
     experiment = read_experiment(folder)
-    rows, iterations, probes = (_table(folder, experiment, name) for name in TABLES)
+    rows, iterations, probes = (_table(folder, experiment, name=name) for name in TABLES)
     rows, iterations = _with_draws(rows, experiment), _with_draws(iterations, experiment)
-    return Evaluation(folder, experiment, rows, iterations, probes)
+    return Evaluation(folder, experiment, rows=rows, iterations=iterations, probes=probes)
 
 
-def _table(folder: Path, experiment: Mapping[str, Any], name: str) -> pd.DataFrame:
+def _table(folder: Path, experiment: Mapping[str, Any], *, name: str) -> pd.DataFrame:
     """Return the rows of a table; none of a kind that the evaluation does not have."""
-    path, table = folder / f"{name}.parquet", TABLES[name].empty_table()
+    path = folder / f"{name}.parquet"
+    table = TABLES[name].empty_table()
     if bool(experiment["policies"]) == (name == "probes"):
         there = path.exists()
         table = (
             pa.parquet.read_table(path, partitioning=None)
             if there
-            else gathered(folder, experiment, name)
+            else gathered(folder, experiment, name=name)
         )
         # Older tables do not have all columns.
         table = pa.concat_tables([TABLES[name].empty_table(), table], promote_options="default")

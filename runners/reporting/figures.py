@@ -64,24 +64,24 @@ Styles = Mapping[str, Style]
 # Colours after Okabe and Ito, and Tol: apart for colour-blind eyes. Variants of a method share a
 # hue, a lighter one and broken lines for the second.
 _KNOWN = {
-    "chsel": Style("CHSEL", "#0072b2", "o", "-"),
-    "chsel_cma_me": Style("CHSEL (CMA-ME)", "#56b4e9", "s", "--"),
-    "gradient_descent": Style("Gradient descent", "#009e73", "^", "-"),
-    "svgd": Style("SVGD", "#e69f00", "D", "-"),
-    "icp": Style("ICP", "#6b6b6b", "P", "-"),
-    "cvo": Style("CVO", "#b2451c", "v", "-"),
-    "cvo_no_free_space": Style("CVO (no free space)", "#f08a5d", "<", "--"),
-    "medial_constraint": Style("Medial Constraint", "#882255", "X", "-"),
-    "medial_constraint_cma_me": Style("Medial Constraint (QD)", "#d889b8", "p", "--"),
+    "chsel": Style("CHSEL", "#0072b2", marker="o", line="-"),
+    "chsel_cma_me": Style("CHSEL (CMA-ME)", "#56b4e9", marker="s", line="--"),
+    "gradient_descent": Style("Gradient descent", "#009e73", marker="^", line="-"),
+    "svgd": Style("SVGD", "#e69f00", marker="D", line="-"),
+    "icp": Style("ICP", "#6b6b6b", marker="P", line="-"),
+    "cvo": Style("CVO", "#b2451c", marker="v", line="-"),
+    "cvo_no_free_space": Style("CVO (no free space)", "#f08a5d", marker="<", line="--"),
+    "medial_constraint": Style("Medial Constraint", "#882255", marker="X", line="-"),
+    "medial_constraint_cma_me": Style("Medial Constraint (QD)", "#d889b8", marker="p", line="--"),
     # policies
-    "grid": Style("grid", "#222222", "s", "--"),
-    "random": Style("random", "#999999", "d", "--"),
-    "nearest_mean": Style("nearest mean", "#56b4e9", "^", "-"),
-    "hit_chance": Style("hit chance", "#e69f00", "v", "-"),
-    "voxel_entropy": Style("voxel entropy", "#882255", "D", "-"),
-    "hypothesis_pruning": Style("hypothesis pruning", "#009e73", "X", "-"),
-    "information": Style("information", "#0072b2", "o", "-"),
-    "expected_loss": Style("expected loss", "#b2451c", "P", "-"),
+    "grid": Style("grid", "#222222", marker="s", line="--"),
+    "random": Style("random", "#999999", marker="d", line="--"),
+    "nearest_mean": Style("nearest mean", "#56b4e9", marker="^", line="-"),
+    "hit_chance": Style("hit chance", "#e69f00", marker="v", line="-"),
+    "voxel_entropy": Style("voxel entropy", "#882255", marker="D", line="-"),
+    "hypothesis_pruning": Style("hypothesis pruning", "#009e73", marker="X", line="-"),
+    "information": Style("information", "#0072b2", marker="o", line="-"),
+    "expected_loss": Style("expected loss", "#b2451c", marker="P", line="-"),
 }
 _OTHERS = ("#117733", "#332288", "#999933", "#999999", "#661100", "#44aa99")
 _OTHER_MARKERS = ("h", "d", ">", "8", "*", "H")
@@ -93,7 +93,7 @@ def styles_of(names: Collection[str]) -> dict[str, Style]:
     for index, name in enumerate(sorted(set(names) - set(_KNOWN))):
         color = _OTHERS[index % len(_OTHERS)]
         marker = _OTHER_MARKERS[(index // len(_OTHERS) + index) % len(_OTHER_MARKERS)]
-        styles[name] = Style(name, color, marker, ":")
+        styles[name] = Style(name, color, marker=marker, line=":")
     return styles
 
 
@@ -124,7 +124,7 @@ def new_figure(height: float) -> Figure:
 
 
 def curves(
-    name: str, data: pd.DataFrame, styles: Styles, across: str, up: str | Mapping[str, str]
+    name: str, data: pd.DataFrame, *, styles: Styles, across: str, up: str | Mapping[str, str]
 ) -> Picture | None:
     """Return a panel a value of the first column, with a line and a band for each of the second.
 
@@ -155,10 +155,10 @@ def curves(
     figure.legend(handles=handles, **place)
     numbers = up if isinstance(up, str) else " and ".join(up.values())
     titles = ", ".join(style.title for style in drawn)
-    return Picture(name, f"{numbers} by {across}: {y} of {titles}.", figure, data)
+    return Picture(name, f"{numbers} by {across}: {y} of {titles}.", figure=figure, data=data)
 
 
-def boxes(name: str, data: pd.DataFrame, styles: Styles, label: str) -> Picture | None:
+def boxes(name: str, data: pd.DataFrame, *, styles: Styles, label: str) -> Picture | None:
     """Return a panel a value of the first column, with a box of the last for each of the second.
 
     label: of the numbers in the last column. None without a row.
@@ -184,7 +184,10 @@ def boxes(name: str, data: pd.DataFrame, styles: Styles, label: str) -> Picture 
         axis.set_xticks(range(len(styles)), titles if lowest else [], rotation=40, ha="right")
         axis.grid(axis="x", visible=False)
     return Picture(
-        name, f"Box plots of {label}: a box for each of {', '.join(titles)}.", figure, data
+        name,
+        f"Box plots of {label}: a box for each of {', '.join(titles)}.",
+        figure=figure,
+        data=data,
     )
 
 
@@ -194,7 +197,8 @@ def _panels(data: pd.DataFrame) -> tuple[Figure, list[tuple[Axes, str, pd.DataFr
     names = list(dict.fromkeys(data[column]))
     across = min(3, len(names))
     down = math.ceil(len(names) / across)
-    figure, panels = new_figure(0.9 + 3.6 * down), []
+    figure = new_figure(0.9 + 3.6 * down)
+    panels = []
     for place, value in enumerate(names):
         axis = figure.add_subplot(down, across, place + 1)
         panels.append((axis, value, data[data[column] == value], place >= len(names) - 3))
@@ -221,9 +225,10 @@ def positive_scale(axes: Axes, values: pd.Series) -> None:
         ticks.set_minor_formatter(NullFormatter())
 
 
-def write_picture(picture: Picture, folder: Path, kind: str) -> tuple[Path, Path]:
+def write_picture(picture: Picture, folder: Path, *, kind: str) -> tuple[Path, Path]:
     """Write the figure in one of the FORMATS, without a clock, and its data as CSV beside it."""
-    path, data = folder / f"{picture.name}.{kind}", folder / f"{picture.name}.csv"
+    path = folder / f"{picture.name}.{kind}"
+    data = folder / f"{picture.name}.csv"
     with whole_file(path) as beside:
         picture.figure.savefig(beside, format=kind, dpi=_DPI, metadata=_NO_CLOCKS[kind])
     with whole_file(data) as beside:

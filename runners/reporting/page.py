@@ -37,7 +37,7 @@ class Section:
 
 
 def as_markdown(
-    evaluation: Evaluation, sections: Sequence[Section], command: str, kind: str
+    evaluation: Evaluation, sections: Sequence[Section], *, command: str, kind: str
 ) -> str:
     """Return the report. command: repeats it. kind: of its pictures' files, one of FORMATS."""
     name = _escaped(evaluation.experiment["name"])

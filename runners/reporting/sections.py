@@ -130,7 +130,7 @@ def sections_of(evaluation: Evaluation, baseline: str | None = None) -> list[Sec
     on = _on_policies if evaluation.experiment["policies"] else _on_methods
     parts, numbers = on(evaluation, baseline)
     every = [
-        Section(title, _TEXTS[title].format(**numbers), tables, picture)
+        Section(title, _TEXTS[title].format(**numbers), tables=tables, picture=picture)
         for title, tables, picture in parts
     ]
     return [
@@ -143,22 +143,24 @@ def sections_of(evaluation: Evaluation, baseline: str | None = None) -> list[Sec
 def _on_methods(
     evaluation: Evaluation, baseline: str | None
 ) -> tuple[Sequence[Part], Mapping[str, object]]:
-    rows, moments, styles = evaluation.rows, evaluation.iterations, styles_of(evaluation.methods)
+    rows = evaluation.rows
+    moments = evaluation.iterations
+    styles = styles_of(evaluation.methods)
     measured = rows if rows[DIVERSITY].notna().any() else rows[:0]
     half, measured_half = last_half(rows), last_half(measured)
     by_step = [
-        method_table(f"PD in mm² of {name} by step", some, "step", styles)
+        method_table(f"PD in mm² of {name} by step", some, by="step", styles=styles)
         for name, some in measured[measured["step"].notna()].groupby("object")
     ]
     by_place = [
-        method_table(f"PD in mm² by {by}", measured_half, by, styles)
+        method_table(f"PD in mm² by {by}", measured_half, by=by, styles=styles)
         for by in ("object", "configuration")
     ]
-    boxed = boxes("pd_boxes", half.loc[half[DIVERSITY].notna(), _BOXED], styles, _PD)
+    boxed = boxes("pd_boxes", half.loc[half[DIVERSITY].notna(), _BOXED], styles=styles, label=_PD)
     beside = [] if baseline is None else against_baseline(evaluation, baseline)
-    over_probes = pd_over_probes("pd_over_probes", rows, styles)
+    over_probes = pd_over_probes("pd_over_probes", rows, styles=styles)
     parts: list[Part] = [
-        (_RUN, _what_was_run(evaluation, rows, "method", styles), None),
+        (_RUN, _what_was_run(evaluation, rows, by="method", styles=styles), None),
         ("True poses", [true_pose_table(evaluation)], None),
         (_FAULTS if has_faults(rows) else _TRUTH_HELD, tables_by_faults(rows, styles), None),
         (BASELINE, beside, None),
@@ -172,8 +174,10 @@ def _on_methods(
         some = {key: styles[key] for key in methods if key in known}
         if len(some) > 1:
             own = half[half["method"].isin(list(some))]
-            tables = [method_table("PD in mm² by object, of these methods", own, "object", some)]
-            parts.append((title, tables, pd_over_probes(name, rows, some)))
+            tables = [
+                method_table("PD in mm² by object, of these methods", own, by="object", styles=some)
+            ]
+            parts.append((title, tables, pd_over_probes(name, rows, styles=some)))
     parts.append(("Calibration and membership", _calibration(half, styles), None))
     return parts, {"baseline": baseline}
 
@@ -184,18 +188,16 @@ def short_tables(evaluation: Evaluation) -> list[Table]:
     if not evaluation.experiment["policies"]:
         styles = styles_of(evaluation.methods)
         note = f"Over all steps of all trials. Plausible sets: {evaluation.definition_text}."
-        medians = method_table("PD in mm² by object", rows, "object", styles, note=note)
+        medians = method_table("PD in mm² by object", rows, by="object", styles=styles, note=note)
         faults = tables_by_faults(rows, styles)
         return [medians, _times_table(rows, styles), *faults, true_pose_table(evaluation)]
-    sessions, styles = (
-        statistics.steered_sessions(evaluation),
-        styles_of(evaluation.experiment["policies"]),
-    )
+    sessions = statistics.steered_sessions(evaluation)
+    styles = styles_of(evaluation.experiment["policies"])
     return [error_table(sessions, styles), needed_table(sessions, styles)] * bool(sessions.count)
 
 
 def _what_was_run(
-    evaluation: Evaluation, rows: pd.DataFrame, by: str, styles: Styles
+    evaluation: Evaluation, rows: pd.DataFrame, *, by: str, styles: Styles
 ) -> list[Table]:
     """Return tables of methods or policies, as `by` says: trials, and rows by status."""
     planned, lines = {*evaluation.planned_trials}, []
@@ -248,45 +250,48 @@ def tables_by_faults(rows: pd.DataFrame, styles: Styles) -> list[Table]:
         rows = pd.concat([rows, rows.assign(faults=_ALL_LEVELS)])
     order.append(_ALL_LEVELS)
     rows = rows.assign(faults=pd.Categorical(rows["faults"], order, ordered=True))
-    held = shares(rows, ["faults", "method"], "truth_held")
+    held = shares(rows, ["faults", "method"], column="truth_held")
     if held.empty and set(levels) <= {CLEAN}:
         return []
     texts = [f"{percent_range(of)} (n {of['total']:.0f})" for _, of in held.iterrows()]
     cells = pd.Series(texts, held.index, dtype=object).unstack()
     having = {key: style for key, style in styles.items() if key in cells}
     note = "95 % intervals (Wilson) as if steps were independent; calibrated sets have 95 %."
-    tables = [pivot_table("Steps with the true pose in the set", cells, having, note=note)]
+    tables = [pivot_table("Steps with the true pose in the set", cells, styles=having, note=note)]
     if set(levels) <= {CLEAN}:
         return tables
     for column, (title, factor) in _FAULTY_COLUMNS.items():
         scaled = rows.assign(**{column: factor * rows[column]})
         some = scaled.groupby("faults", observed=True)[column].transform("count") > 0
-        tables.append(method_table(title, scaled[some], "faults", styles, column))
+        tables.append(method_table(title, scaled[some], by="faults", styles=styles, column=column))
     return tables
 
 
 def against_baseline(evaluation: Evaluation, baseline: str) -> list[Table]:
     """Return tables of all methods beside one; raise SettingError if that has no PD."""
-    rows, styles = statistics.with_ratios(evaluation.rows, baseline), styles_of(evaluation.methods)
+    rows = statistics.with_ratios(evaluation.rows, baseline)
+    styles = styles_of(evaluation.methods)
     if rows["ratio"].isna().all():
         known = ", ".join(sorted(rows["method"].unique()))
         raise SettingError(f"baseline {baseline} has no PD; accepted: {known}")
     lines = []
     for method, style in styles.items():
         own = rows[rows["method"] == method]
-        diversity, distinct = own[DIVERSITY], own["distinct"].dropna().astype(float)
+        diversity = own[DIVERSITY]
+        distinct = own["distinct"].dropna().astype(float)
         left_out = diversity.isna().sum()
         lower, median, upper = diversity.quantile([0.25, 0.5, 0.75])
         lower = lower if diversity.count() > 1 else math.nan  # one number has no quartiles
         # The rounding of a geometric mean makes no PD worse.
         worse = percent((own["ratio"].dropna() > 1.0 + 1e-9).mean())
+        mean, least, most = statistics.ratio_interval(own)
         lines.append(
             {
                 "method": style.title,
                 "n": f"{diversity.count()}" + (f" ({left_out} left out)" if left_out else ""),
-                "PD in mm², median [quartiles]": with_range(median, lower, upper),
+                "PD in mm², median [quartiles]": with_range(median, lower, upper=upper),
                 "geometric mean": geometric_mean(own["floored"]),
-                f"ratio to {baseline} [95 %]": with_range(*statistics.ratio_interval(own)),
+                f"ratio to {baseline} [95 %]": with_range(mean, lower=least, upper=most),
                 "worse": "-" if method == baseline else worse,
                 "members": percent(own["exact_members"].mean()),
                 "distinct [least]": f"{number(distinct.mean())} [{number(distinct.min())}]",
@@ -301,21 +306,21 @@ def against_baseline(evaluation: Evaluation, baseline: str) -> list[Table]:
     tables = [table_of("PD and its ratios over all registrations", lines, note=note)]
     for by in ("object", "step"):
         found = rows.groupby([by, "method"])["ratio"].agg(geometric_mean).map(number).unstack()
-        tables.append(pivot_table(f"Ratios of PD by {by}, geometric means", found, styles))
+        tables.append(pivot_table(f"Ratios of PD by {by}, geometric means", found, styles=styles))
     return tables
 
 
-def pd_over_probes(name: str, rows: pd.DataFrame, styles: Styles) -> Picture | None:
+def pd_over_probes(name: str, rows: pd.DataFrame, *, styles: Styles) -> Picture | None:
     """Return medians and quartiles of PD at every step, by object and method."""
     rows = rows[rows["method"].isin(list(styles)) & rows[DIVERSITY].notna()]
-    found = statistics.spreads(rows, ["object", "method", "step"], DIVERSITY).reset_index()
+    found = statistics.spreads(rows, ["object", "method", "step"], column=DIVERSITY).reset_index()
     data = found[["object", "method", "step", *_QUARTILES]]
-    return curves(name, data, styles, "step (index of the probe)", _PD)
+    return curves(name, data, styles=styles, across="step (index of the probe)", up=_PD)
 
 
 def _times_table(rows: pd.DataFrame, styles: Styles) -> Table:
     """Return milliseconds of a registration, a row for every method."""
-    found = statistics.spreads(rows.assign(ms=_MM * rows["seconds"]), "method", "ms")
+    found = statistics.spreads(rows.assign(ms=_MM * rows["seconds"]), "method", column="ms")
     found = found.query("count > 0").reindex(list(styles)).dropna().astype({"count": int})
     cells = median_cells(found.assign(left_out=0, count=1), "min")
     lines = found.assign(method=[styles[str(key)].title for key in found.index], median=cells)
@@ -332,11 +337,11 @@ def _over_iterations(moments: pd.DataFrame, styles: Styles) -> Part:
             rows = rows[~rows["method"].str.startswith(_OTHER_COST)]
         shown = {key: s for key, s in styles.items() if (rows["method"] == key).any()}
         title = f"{label} by iteration"
-        tables.append(method_table(title, rows, "iteration", shown, column))
-        found = statistics.spreads(rows, ["method", "iteration"], column).reset_index()
+        tables.append(method_table(title, rows, by="iteration", styles=shown, column=column))
+        found = statistics.spreads(rows, ["method", "iteration"], column=column).reset_index()
         parts.append(found.assign(number=column))
     data = pd.concat(parts)[["number", "method", "iteration", *_QUARTILES]]
-    picture = curves("over_iterations", data, styles, "QD iterations", _MOMENTS)
+    picture = curves("over_iterations", data, styles=styles, across="QD iterations", up=_MOMENTS)
     return "Plausible diversity and cost over QD iterations", tables, picture
 
 
@@ -347,8 +352,8 @@ def _calibration(half: pd.DataFrame, styles: Styles) -> list[Table]:
     title = "Rank of the true pose among the hypotheses"
     share = "Share of hypotheses in the plausible set"
     return [
-        method_table(title, ranks, "object", styles, "rank", note),
-        method_table(share, members, "object", styles, "exact_members"),
+        method_table(title, ranks, by="object", styles=styles, column="rank", note=note),
+        method_table(share, members, by="object", styles=styles, column="exact_members"),
     ]
 
 
@@ -358,7 +363,7 @@ def _on_policies(
     sessions = statistics.steered_sessions(evaluation, reference)
     every = styles_of(evaluation.experiment["policies"])
     styles = {policy: every[policy] for policy in sessions.policies}
-    run = (_RUN, _what_was_run(evaluation, evaluation.probes, "policy", every), None)
+    run = (_RUN, _what_was_run(evaluation, evaluation.probes, by="policy", styles=every), None)
     if sessions.count == 0:
         return [run], {}
     numbers = {
@@ -368,7 +373,7 @@ def _on_policies(
         "compared": sessions.compared,
         "reference": styles[sessions.reference].title,
     }
-    spread = _means_table(sessions, styles, "spread", "Spread of the belief, mm")
+    spread = _means_table(sessions, styles, column="spread", title="Spread of the belief, mm")
     errors = [error_table(sessions, styles), spread]
     calibrated = [*_hit_tables(sessions, styles), _stops_table(sessions, styles)]
     beliefs = _belief_tables(sessions)
@@ -386,10 +391,12 @@ def _on_policies(
 
 def error_table(sessions: SteeredSessions, styles: Styles) -> Table:
     """Return geometric means of the errors after so many probes, mm."""
-    return _means_table(sessions, styles, "error", "Error of the set after so many probes, mm")
+    return _means_table(
+        sessions, styles, column="error", title="Error of the set after so many probes, mm"
+    )
 
 
-def _means_table(sessions: SteeredSessions, styles: Styles, column: str, title: str) -> Table:
+def _means_table(sessions: SteeredSessions, styles: Styles, *, column: str, title: str) -> Table:
     means = _MM * statistics.geometric_means(sessions.over_probes(column)).loc[sessions.policies]
     shown = [n for n in means.columns if n <= 2 or n % 2 == 0 or n == sessions.budget]
     columns = {str(n): _bold(means[n]) for n in shown}
@@ -404,7 +411,7 @@ def _means_over_probes(sessions: SteeredSessions, styles: Styles) -> Picture | N
     """Return errors and spreads with their intervals, mm."""
     data = pd.concat([statistics.means_with_intervals(sessions, name) for name in _OVER_PROBES])
     data[["lower", "mean", "upper"]] *= _MM
-    return curves("error_over_probes", data, styles, "probes", _OVER_PROBES)
+    return curves("error_over_probes", data, styles=styles, across="probes", up=_OVER_PROBES)
 
 
 def needed_table(sessions: SteeredSessions, styles: Styles) -> Table:
@@ -437,7 +444,7 @@ def _quartiles(needed: pd.Series, budget: int) -> str:
 
 def _share(flags: pd.Series) -> str:
     """Return the share of the flags that are set, with its interval."""
-    found = shares(pd.DataFrame({_ALL: 0, "flag": flags}), _ALL, "flag")
+    found = shares(pd.DataFrame({_ALL: 0, "flag": flags}), _ALL, column="flag")
     return percent_range(found.iloc[0]) if len(found) else "-"
 
 
@@ -451,7 +458,7 @@ def _compared(sessions: SteeredSessions, styles: Styles) -> list[Table]:
         line = {"policy": styles[policy].title, "sessions": of["sessions"]}
         line |= {f"{reference} better": of["wins"], "worse": of["losses"]}
         line |= {"sign test, p": f"{of['sign_test']:.2g}", "ratio, median": of["median"]}
-        mean = with_range(of["mean"], of["lower"], of["upper"])
+        mean = with_range(of["mean"], of["lower"], upper=of["upper"])
         lines.append(line | {"ratio, geometric mean [95 %]": mean})
     note = "Intervals by a bootstrap over configurations, or over sessions if these are few."
     title = f"Error beside {reference} after {sessions.compared} probes"
@@ -463,11 +470,11 @@ def _compared(sessions: SteeredSessions, styles: Styles) -> list[Table]:
     tables.append(table_of(title, [line | {"largest": f"{ratios.max():.2f}"}], note=note))
     for by in ("configuration", "faults"):
         if by == "configuration" or sessions.rows[by].nunique() > 1:
-            tables.append(_by_table(sessions, styles, by))
+            tables.append(_by_table(sessions, styles, by=by))
     return tables
 
 
-def _by_table(sessions: SteeredSessions, styles: Styles, by: str) -> Table:
+def _by_table(sessions: SteeredSessions, styles: Styles, *, by: str) -> Table:
     """Return geometric means of the errors by what a column of the rows holds, mm."""
     cells, counts = {}, {}
     for value, some in sessions.rows.groupby(by):
@@ -478,7 +485,7 @@ def _by_table(sessions: SteeredSessions, styles: Styles, by: str) -> Table:
     frame = pd.DataFrame.from_dict(cells, "index", columns=sessions.policies).rename_axis(by)
     title = f"Error after {sessions.compared} probes by {by}, mm"
     note = "Geometric means over n sessions of a policy."
-    return pivot_table(title, frame, styles, counts, note)
+    return pivot_table(title, frame, styles=styles, counts=counts, note=note)
 
 
 def _bold(means: pd.Series) -> list[str]:
@@ -499,14 +506,16 @@ def _hit_tables(sessions: SteeredSessions, styles: Styles) -> list[Table]:
             texts["difference, points"] = f"{forecast - happened:+.1f}"
             lines.append({"policy": title, "probes": len(own), **texts})
     means = table_of("Chance of a hit, forecast and happened, %", lines)
-    bins = _tenths(rows, "hit_forecast", "hit", "probes")
+    bins = _tenths(rows, "hit_forecast", happened="hit", counted="probes")
     return [means, table_of("Hits by their forecast, all policies", bins)]
 
 
-def _tenths(rows: pd.DataFrame, forecast: str, happened: str, counted: str) -> list[dict[str, Any]]:
+def _tenths(
+    rows: pd.DataFrame, forecast: str, *, happened: str, counted: str
+) -> list[dict[str, Any]]:
     """Return a line for every tenth of a chance, with what happened."""
     lines = []
-    for tenth, of in statistics.by_tenths(rows, forecast, happened).iterrows():
+    for tenth, of in statistics.by_tenths(rows, forecast, happened=happened).iterrows():
         line = {"forecast": f"{10 * tenth} to {10 * tenth + 10} %", counted: int(of["total"])}
         line["mean forecast"] = f"{100.0 * of['forecast']:.0f} %"
         lines.append(line | {"happened [95 %]": percent_range(of)})
@@ -524,7 +533,7 @@ def _belief_tables(sessions: SteeredSessions) -> list[Table]:
             line |= {name: percent(own[column].mean()) for column, name in _MIDDLES.items()}
             line["best grasp said to work"] = percent(own["grasp_chance"].mean())
             lines.append(line | {"works": _share(own["grasp_works"])})
-    bins = _tenths(rows, "grasp_chance", "grasp_works", "grasps")
+    bins = _tenths(rows, "grasp_chance", happened="grasp_works", counted="grasps")
     note = "The true pose along the three directions in which members spread the most."
     return [
         table_of("Beliefs by the number of contacts", lines, note=note),

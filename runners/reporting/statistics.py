@@ -25,7 +25,7 @@ SESSION = ["policy", *TRIAL]  # the columns that tell sessions apart
 _RESAMPLES, _FEW = 2000, 5
 
 
-def spreads(rows: pd.DataFrame, by: str | Sequence[str], column: str) -> pd.DataFrame:
+def spreads(rows: pd.DataFrame, by: str | Sequence[str], *, column: str) -> pd.DataFrame:
     """Return a row per group with the spread of a column's numbers; NaN where there are none.
 
     left_out: how many are missing. lower, upper: quartiles, interpolated; a single number has none.
@@ -46,7 +46,7 @@ def spreads(rows: pd.DataFrame, by: str | Sequence[str], column: str) -> pd.Data
     )
 
 
-def shares(rows: pd.DataFrame, by: str | Sequence[str], column: str) -> pd.DataFrame:
+def shares(rows: pd.DataFrame, by: str | Sequence[str], *, column: str) -> pd.DataFrame:
     """Return a row per group with flags: how many are set, of how many, and their share.
 
     lower, upper: 95 % interval of the share of independent cases (Wilson's score interval).
@@ -112,12 +112,12 @@ def censored_quantile(numbers: pd.Series, share: float) -> float:
     return float(np.quantile(numbers, share, method="inverted_cdf")) if len(numbers) else math.nan
 
 
-def by_tenths(rows: pd.DataFrame, forecast: str, happened: str) -> pd.DataFrame:
+def by_tenths(rows: pd.DataFrame, forecast: str, *, happened: str) -> pd.DataFrame:
     """Return `shares` by tenths of the forecast, with the mean `forecast` of each."""
     tenths = np.digitize(rows[forecast], np.linspace(0.0, 1.0, 11)).clip(max=10) - 1
     rows = rows.assign(tenth=tenths)
     forecasts = rows.groupby("tenth")[forecast].mean()
-    return shares(rows, "tenth", happened).join(forecasts.rename("forecast"))
+    return shares(rows, "tenth", column=happened).join(forecasts.rename("forecast"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +181,9 @@ def steered_sessions(evaluation: Evaluation, reference: str | None = None) -> St
     budget = min((one["settings"]["probes"] for one in asked.values()), default=1)
     rows = rows[kept & (rows["probes"] <= budget)].reset_index(drop=True)
     left_out = len(having) - len(common)
-    return SteeredSessions(policies, budget, rows, len(common), left_out, reference or "")
+    return SteeredSessions(
+        policies, budget, rows=rows, count=len(common), left_out=left_out, reference=reference or ""
+    )
 
 
 def geometric_means(values: pd.DataFrame) -> pd.DataFrame:
@@ -195,7 +197,8 @@ def _logs(errors: Any) -> Any:
 
 def means_with_intervals(sessions: SteeredSessions, column: str) -> pd.DataFrame:
     """Return `mean`, geometric, and its 95 % interval by number (the column), policy and probes."""
-    logs, lines = _logs(sessions.over_probes(column)), []
+    logs = _logs(sessions.over_probes(column))
+    lines = []
     for policy in sessions.policies:
         for probes, own in logs.loc[policy].items():
             lower, upper = bootstrap_interval(own)
@@ -217,7 +220,8 @@ def paired(sessions: SteeredSessions, policy: str) -> dict[str, float]:
     """
     errors = _logs(sessions.errors[sessions.compared])
     logs = errors.loc[policy] - errors.loc[sessions.reference]
-    wins, losses = int((logs > 0.0).sum()), int((logs < 0.0).sum())
+    wins = int((logs > 0.0).sum())
+    losses = int((logs < 0.0).sum())
     test = float(binomtest(wins, wins + losses).pvalue) if wins + losses else 1.0
     lower, upper = bootstrap_interval(logs)
     ratios = {"median": logs.median(), "mean": logs.mean(), "lower": lower, "upper": upper}

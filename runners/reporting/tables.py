@@ -37,7 +37,9 @@ def table_of(
         tuple(number(cell) if isinstance(cell, float) else str(cell) for cell in line.values())
         for line in lines
     ]
-    return Table(title, tuple(lines[0]) if lines else (), tuple(rows), labels, note)
+    return Table(
+        title, tuple(lines[0]) if lines else (), rows=tuple(rows), labels=labels, note=note
+    )
 
 
 def number(value: float) -> str:
@@ -50,7 +52,7 @@ def number(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 1000.0 or "e" in text else text
 
 
-def with_range(value: float, lower: float, upper: float) -> str:
+def with_range(value: float, lower: float, *, upper: float) -> str:
     """Return a number and a range, such as quartiles: "26.1 [17.5, 37.5]"; alone if that is NaN."""
     known = f" [{number(lower)}, {number(upper)}]" if math.isfinite(lower) else ""
     return number(value) + known
@@ -67,7 +69,7 @@ def percent_range(found: Any) -> str:
     return f"{share:.0f} % [{lower:.0f}, {upper:.0f}]"
 
 
-def bold_best(values: Sequence[float], texts: Sequence[str], best: Best = "min") -> list[str]:
+def bold_best(values: Sequence[float], texts: Sequence[str], *, best: Best = "min") -> list[str]:
     """Return the texts of some values, the best in bold, if there are several values."""
     known = [value for value in values if math.isfinite(value)]
     bold = {"min": min, "max": max}[best](known) if best and len(known) > 1 else None
@@ -78,34 +80,43 @@ def bold_best(values: Sequence[float], texts: Sequence[str], best: Best = "min")
 
 def median_cells(found: pd.DataFrame, best: Best) -> list[str]:
     """Return median [quartiles] of each of the `spreads`; a note where numbers are fewer."""
-    most, cells = found["count"].max(), []
+    most = found["count"].max()
+    cells = []
     for _, each in found.iterrows():
         notes = [f"n {each['count']:.0f}"] if 0 < each["count"] < most else []
         notes += [f"{each['left_out']:.0f} left out"] if each["left_out"] > 0 else []
         note = f" ({', '.join(notes)})" if notes else ""
-        cells.append(with_range(each["median"], each["lower"], each["upper"]) + note)
-    return bold_best(found["median"].tolist(), cells, best)
+        cells.append(with_range(each["median"], each["lower"], upper=each["upper"]) + note)
+    return bold_best(found["median"].tolist(), cells, best=best)
 
 
 def method_table(
-    title: str, rows: pd.DataFrame, by: str, styles: Styles, column: str = DIVERSITY, note: str = ""
+    title: str,
+    rows: pd.DataFrame,
+    *,
+    by: str,
+    styles: Styles,
+    column: str = DIVERSITY,
+    note: str = "",
 ) -> Table:
     """Return median [quartiles] of a column by the values of another (rows) and by method.
 
     n: of numbers behind a median; a cell that has fewer says so.
     """
     cells, counts = {}, {}
-    for value, found in spreads(rows, [by, "method"], column).groupby(level=0, observed=True):
+    for value, found in spreads(rows, [by, "method"], column=column).groupby(
+        level=0, observed=True
+    ):
         of_methods = found.droplevel(0).reindex(list(styles))
         of_methods["count"] = of_methods["count"].fillna(0)
         cells[value] = median_cells(of_methods, _BEST.get(column, "min"))
         counts[value] = int(of_methods["count"].max())
     frame = pd.DataFrame.from_dict(cells, "index", columns=list(styles)).rename_axis(by)
-    return pivot_table(title, frame, styles, counts, note)
+    return pivot_table(title, frame, styles=styles, counts=counts, note=note)
 
 
 def pivot_table(
-    title: str, cells: pd.DataFrame, styles: Styles, counts: Any = None, note: str = ""
+    title: str, cells: pd.DataFrame, *, styles: Styles, counts: Any = None, note: str = ""
 ) -> Table:
     """Return texts by the index (rows) and by method or policy (columns). counts: n by row."""
     lines = []

@@ -40,13 +40,13 @@ class GraspConfig(CheckedSettings):
             file = read_npz(Path(self.path), error=SettingError)
             if file.keys() != {"object_from_gripper", "width"}:
                 raise SettingError(f"its arrays are {', '.join(file) or 'none'}")
-            poses = frozen("object_from_gripper", file["object_from_gripper"], (None, 4, 4))
+            poses = frozen("object_from_gripper", file["object_from_gripper"], shape=(None, 4, 4))
             poses = nearest_rigid("object_from_gripper", poses)
-            width = frozen("width", np.broadcast_to(file["width"], len(poses)), (None,))
+            width = frozen("width", np.broadcast_to(file["width"], len(poses)), shape=(None,))
             if len(poses) == 0 or not width.min() > 0.0:
                 raise SettingError("it has no grasp, or a width that is not above 0")
         except (ChselError, ValueError) as error:
             accepted = "an .npz file with object_from_gripper (G, 4, 4) and width (G,), metres"
             text = f"grasp.path is {self.path} ({error}); accepted: {accepted}"
             raise SettingError(text) from None
-        return Grasps(poses, width, self.gripper, self.sure)
+        return Grasps(poses, width, gripper=self.gripper, sure=self.sure)

@@ -66,7 +66,7 @@ def steps(
         if "digest" not in row:
             text += ", too little for a registration"
         text += f"; {run.trust}" if "verdict" in row else ""
-        run.observe(Logged(run.step, "info", text))
+        run.observe(Logged(run.step, "info", text=text))
         if timings:
             run.observe(Timed(run.step, run.seconds))
         run.flush()
@@ -79,7 +79,8 @@ def steps(
 
 def _numbers(registered: Registered) -> Row:
     """Return numbers about a registration."""
-    found, trust = registered.hypotheses, registered.hypotheses.trust
+    found = registered.hypotheses
+    trust = registered.hypotheses.trust
     row: Row = {"best_cost": float(found.cost[0])} if len(found.cost) else {}
     row |= {"distinct": found.distinct, "digest": found.digest, **registered.numbers}
     row["registration_seconds"] = registered.total_seconds

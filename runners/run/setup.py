@@ -83,7 +83,7 @@ class RunSetup:
 
     @property
     def report(self) -> Report | None:
-        """What became of sensors' images, once they are read."""
+        """Counts of sensors' messages, once they are read; None without sensors."""
         return self.source.report
 
     @property
@@ -114,7 +114,7 @@ def open_setup(config: ProbeConfig) -> RunSetup:
     policy = build_policy(policy_name, values)
     found: list[InputWarning] = []
     if kind.object is ObjectOrigin.RECORDED:
-        source = open_source(kind_name, settings, None, config.seed)
+        source = open_source(kind_name, settings, object_model=None, seed=config.seed)
         assert source.recorded is not None
         setup = RunSetup(
             source,
@@ -127,7 +127,7 @@ def open_setup(config: ProbeConfig) -> RunSetup:
     else:
         with _caught() as found:
             model = load_object(config.object, config.assets.folder)
-            source = open_source(kind_name, settings, model, config.seed)
+            source = open_source(kind_name, settings, object_model=model, seed=config.seed)
             sdf = model.grid(settings)
         found += source.warnings
         if kind.object is ObjectOrigin.REAL:
@@ -167,7 +167,7 @@ def _caught() -> Iterator[list[InputWarning]]:
 
 
 def session_started(
-    config: ProbeConfig, values: Mapping[str, Any], method_name: str, setup: RunSetup
+    config: ProbeConfig, values: Mapping[str, Any], *, method_name: str, setup: RunSetup
 ) -> SessionStarted:
     """Return the first event of the recording."""
     source = setup.source

@@ -49,7 +49,7 @@ class FreeMap:
         return ((points >= lower - margin) & (points <= upper + margin)).all(axis=1)
 
 
-def is_entered(workspace: Workspace, origin: FloatArray, ends: FloatArray) -> bool:
+def is_entered(workspace: Workspace, origin: FloatArray, *, ends: FloatArray) -> bool:
     """Return whether over a thousandth of segments from origin (3,) to ends (N, 3) enter it."""
     lower, upper = workspace.bounds
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -76,10 +76,10 @@ class RobotCell:
         """Side of a free voxel, metres."""
         return self.free.grid.lattice.spacing
 
-    def world_from(self, frame: str, time: int, sensor: str) -> FloatArray | None:
+    def world_from(self, frame: str, time: int, *, sensor: str) -> FloatArray | None:
         """Return the pose (4, 4) of a frame at a time, ns; None, with a warning, if unknown."""
         try:
-            return self.tree.lookup(self.world, frame, time, gap_s=self.gap)
+            return self.tree.lookup(self.world, frame, stamp_ns=time, gap_s=self.gap)
         except TransformError:
             self.warnings.warn(f"{sensor}: left out, as the pose of {frame} is not known then")
             return None

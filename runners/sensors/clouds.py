@@ -28,7 +28,7 @@ class Cloud:
     def __init__(self, rig: CloudRig, resolution: float) -> None:
         """Make the sensor; of surface points one a voxel of side `resolution`, metres, is kept."""
         self.name = rig.topic
-        self.topics = (SensorTopic(rig.topic, CloudMessage, "points"),)
+        self.topics = (SensorTopic(rig.topic, CloudMessage, use="points"),)
         self.frame = None
         self._rig = rig
         self._resolution = resolution
@@ -43,13 +43,13 @@ class Cloud:
         self._cell = cell
         self._lattice = Lattice(cell.free.workspace.lower, self._resolution)
 
-    def take(self, time: int, message: CloudMessage, counts: Counts, *, within: bool) -> None:
+    def take(self, time: int, message: CloudMessage, *, counts: Counts, within: bool) -> None:
         """Use the points of one message of the current probe."""
         counts.images += 1
         if self._touches and not within:
             counts.spared += 1
             return
-        pose = self._cell.world_from(message.frame, time, self._rig.topic)
+        pose = self._cell.world_from(message.frame, time, sensor=self._rig.topic)
         if pose is None:
             counts.lost += 1
             return
@@ -57,14 +57,16 @@ class Cloud:
         counts.pixels += len(message.points)
         counts.invalid += len(message.points) - len(points)
         counts.used += 1
-        points, origin, free = apply(pose, points), pose[:3, 3], self._cell.free
+        points = apply(pose, points)
+        origin = pose[:3, 3]
+        free = self._cell.free
         if self._middle is None and len(points):
             self._middle = np.median(points, axis=0)
         if self._rig.role == "rays":
             reached = ((points - origin) ** 2).sum(axis=1) <= FARTHEST**2
             ends = origin + self._rig.fraction * (points[reached] - origin)
             counts.free += free.grid.along_rays(origin, ends)
-            self._reaches = self._reaches or is_entered(free.workspace, origin, ends)
+            self._reaches = self._reaches or is_entered(free.workspace, origin, ends=ends)
         else:
             reached = free.within(points)
             self._new.append(self._unseen(points[reached], counts))

@@ -54,6 +54,7 @@ class View:
 def view_of(
     message: ImageMessage,
     time: int,
+    *,
     rig: ImageRig,
     camera: PinholeCamera,
     cell: RobotCell,
@@ -67,7 +68,7 @@ def view_of(
         )
         counts.unusable += 1
         return None
-    world_from_camera = cell.world_from(rig.frame or message.frame, time, rig.name)
+    world_from_camera = cell.world_from(rig.frame or message.frame, time, sensor=rig.name)
     if world_from_camera is None:
         counts.lost += 1
         return None
@@ -75,7 +76,7 @@ def view_of(
     valid = valid_pixels(depth, nearest=rig.range[0], furthest=rig.range[1])
     counts.pixels += valid.size
     counts.invalid += int(valid.size - valid.sum())
-    return View(depth, valid, camera, world_from_camera)
+    return View(depth, valid, camera=camera, world_from_camera=world_from_camera)
 
 
 def metres(values: np.ndarray, unit: float | None) -> FloatArray:
@@ -85,39 +86,54 @@ def metres(values: np.ndarray, unit: float | None) -> FloatArray:
     return values.astype(np.float64) * unit
 
 
-def recorded_image(step: int, sensor: str, kind: str, view: View, mask: BoolArray) -> SensorImage:
+def recorded_image(
+    step: int, sensor: str, *, kind: str, view: View, mask: BoolArray
+) -> SensorImage:
     """Return an image with a mask (H, W) as recordings have it, 0 where it is not valid."""
-    kept, camera = np.where(view.valid, view.metres, 0.0), view.camera
+    kept = np.where(view.valid, view.metres, 0.0)
+    camera = view.camera
     unit = FINE if kept.max(initial=0.0) < 65535 * FINE else COARSE
     values = np.clip(np.rint(kept / unit), 0, 65535).astype(np.uint16)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    return SensorImage(step, sensor, kind, values, unit, mask, intrinsics, view.world_from_camera)
+    return SensorImage(
+        step=step,
+        sensor=sensor,
+        kind=kind,
+        values=values,
+        unit=unit,
+        mask=mask,
+        intrinsics=intrinsics,
+        world_from_camera=view.world_from_camera,
+    )
 
 
 def edge_pixels(rig: CameraRig, view: View) -> BoolArray:
     """Return valid pixels (H, W) beside a jump of depth; none, if the rig asks for all."""
     if rig.edge is None:
         return np.zeros_like(view.valid)
-    return occlusion_edges(view.metres, view.valid, rig.edge, reach=rig.edge_reach)
+    return occlusion_edges(view.metres, view.valid, jump=rig.edge, reach=rig.edge_reach)
 
 
 def mark_rays(
-    grid: FreeGrid, rig: CameraRig, gate: GateRig, view: View, usable: BoolArray
+    grid: FreeGrid, rig: CameraRig, *, gate: GateRig, view: View, usable: BoolArray
 ) -> tuple[int, int]:
     """Mark what the rays of usable pixels (H, W) pass.
 
     The rays of speckles end at the least depth of the valid pixels around them. Return how many
     voxels became free, and how many pixels are of speckles.
     """
-    regions = depth_regions(view.metres, usable, view.camera, gate.jump)
-    ends, small = speckle_free(view.metres, view.valid, regions, gate.speckle)
+    regions = depth_regions(view.metres, usable, camera=view.camera, jump=gate.jump)
+    ends, small = speckle_free(view.metres, view.valid, regions=regions, least=gate.speckle)
     pose = view.world_from_camera
-    return grid.from_depth(ends, view.camera, pose, usable, fraction=rig.fraction), small
+    return grid.from_depth(
+        ends, view.camera, world_from_camera=pose, mask=usable, fraction=rig.fraction
+    ), small
 
 
-def some_rays(rig: CameraRig, view: View, usable: BoolArray) -> tuple[FloatArray, FloatArray]:
+def some_rays(rig: CameraRig, view: View, *, usable: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Return origin (3,) and ends (N, 3), world, of rays of some of the usable pixels (H, W)."""
-    pose, some = view.world_from_camera, slice(None, None, 1 + usable.size // _MANY_PIXELS)
+    pose = view.world_from_camera
+    some = slice(None, None, 1 + usable.size // _MANY_PIXELS)
     ends = rig.fraction * view.camera.back_project(view.metres)[some, some]
     return pose[:3, 3], apply(pose, ends[usable[some, some]])
 
@@ -125,8 +141,8 @@ def some_rays(rig: CameraRig, view: View, usable: BoolArray) -> tuple[FloatArray
 def image_topics(rig: ImageRig) -> tuple[SensorTopic, SensorTopic]:
     """Return the topics of a sensor that sends depth images: images and intrinsics."""
     return (
-        SensorTopic(rig.depth, ImageMessage, f"depth of {rig.name}"),
-        SensorTopic(rig.info, CameraInfoMessage, f"camera info of {rig.name}"),
+        SensorTopic(rig.depth, ImageMessage, use=f"depth of {rig.name}"),
+        SensorTopic(rig.info, CameraInfoMessage, use=f"camera info of {rig.name}"),
     )
 
 
@@ -220,13 +236,15 @@ class DepthCamera:
         if self._rig.views > 1:
             self._views = FreeGrid(cell.free.workspace, cell.spacing, views=self._rig.views)
 
-    def take(self, time: int, message: ImageMessage, counts: Counts, *, within: bool) -> None:
+    def take(self, time: int, message: ImageMessage, *, counts: Counts, within: bool) -> None:
         """Use an image of the current probe, unless it comes too soon after the last one."""
         counts.images += 1
         if self._too_soon(time):
             counts.spared += 1
             return
-        view = view_of(message, time, self._rig, self._camera, self._cell, counts)
+        view = view_of(
+            message, time, rig=self._rig, camera=self._camera, cell=self._cell, counts=counts
+        )
         if view is None:
             return
         edges = edge_pixels(self._rig, view)
@@ -237,13 +255,15 @@ class DepthCamera:
             self._cell.warnings.warn(f"{self._rig.name}: an image without a pixel that counts")
             return
         grid = self._cell.free.grid
-        fresh, small = mark_rays(self._views or grid, self._rig, self._cell.gate, view, usable)
+        fresh, small = mark_rays(
+            self._views or grid, self._rig, gate=self._cell.gate, view=view, usable=usable
+        )
         counts.free += fresh if self._views is None else grid.at(self._views.new())
         counts.small += small
         counts.used += 1
         if not self._reaches:
-            origin, ends = some_rays(self._rig, view, usable)
-            self._reaches = is_entered(self._cell.free.workspace, origin, ends)
+            origin, ends = some_rays(self._rig, view, usable=usable)
+            self._reaches = is_entered(self._cell.free.workspace, origin, ends=ends)
         self._last_time = time
         self._last = (view, usable)
 
@@ -253,7 +273,7 @@ class DepthCamera:
             return Sensed()
         view, usable = self._last
         self._last = None
-        return Sensed(image=recorded_image(step, self.name, "depth", view, usable))
+        return Sensed(image=recorded_image(step, self.name, kind="depth", view=view, mask=usable))
 
     def remark(self, total: Counts) -> str:
         """Return what is suspicious about all that it gave; "" if nothing is."""

@@ -89,7 +89,7 @@ def read_depth_frame(path: str | Path) -> DepthFrame:
     """
     path = Path(path).expanduser()
     try:
-        return _frame(build_settings(FrameFile, read_yaml(path), "frame"), path.parent)
+        return _frame(build_settings(FrameFile, read_yaml(path), where="frame"), path.parent)
     except (ChselError, OverflowError) as error:  # an integer of many digits
         raise SessionError(f"depth frame {path}: {error}") from None
 
@@ -101,10 +101,12 @@ def _frame(file: FrameFile, folder: Path) -> DepthFrame:
     return DepthFrame(
         PinholeCamera(width=width, height=height, **asdict(file.intrinsics)),
         depth,
-        np.eye(4) if camera is None else pose_of_rows("world_from_camera", camera),
-        None if file.label is None else _label(file, folder, depth.shape),
-        None if truth is None else pose_of_rows("world_from_object", truth),
-        None if file.object is None else folder / Path(file.object).expanduser(),
+        world_from_camera=np.eye(4)
+        if camera is None
+        else pose_of_rows("world_from_camera", camera),
+        label=None if file.label is None else _label(file, folder, shape=depth.shape),
+        world_from_object=None if truth is None else pose_of_rows("world_from_object", truth),
+        mesh=None if file.object is None else folder / Path(file.object).expanduser(),
     )
 
 
@@ -121,12 +123,13 @@ def _depth(file: FrameFile, folder: Path) -> FloatArray:
     return depth
 
 
-def _label(file: FrameFile, folder: Path, shape: tuple[int, ...]) -> BoolArray:
+def _label(file: FrameFile, folder: Path, *, shape: tuple[int, ...]) -> BoolArray:
     """Return the object's pixels (H, W)."""
     path = folder / Path(file.label or "").expanduser()
     classes = read_image(path, "label")
     if classes.dtype.kind not in "ui" or classes.shape != shape:
-        (height, width), (rows, columns) = shape, classes.shape
+        (height, width) = shape
+        (rows, columns) = classes.shape
         raise SessionError(
             f"label {path}: {columns} x {rows} pixels of {classes.dtype}; accepted: whole numbers, "
             f"as many as of depth, {width} x {height}"
@@ -170,33 +173,41 @@ def depth_frame_points(
             f"no pixel of depth lies in the range of camera {camera.name}, {nearest:g} m to "
             f"{furthest:g} m; its median is {typical:.4g} m: check depth_scale"
         )
-    view = View(frame.depth, valid, frame.camera, frame.world_from_camera)
+    view = View(frame.depth, valid, camera=frame.camera, world_from_camera=frame.world_from_camera)
     edges = edge_pixels(camera, view)
     measured = frame.camera.back_project(frame.depth)
     counts = Counts(images=1, used=1, pixels=valid.size, invalid=int((~valid).sum()))
     counts.edges = int(edges.sum())
     rays = valid & ~edges
-    surface, labelled = np.zeros_like(valid), None
+    surface = np.zeros_like(valid)
+    labelled = None
     if frame.label is not None:
-        surface, labelled = _surface_pixels(frame.label, view, edges, rig, measured, diameter)
+        surface, labelled = _surface_pixels(
+            frame.label, view, edges=edges, rig=rig, measured=measured, diameter=diameter
+        )
         rays &= surface | ~frame.label
-        counts.outline, counts.far, counts.small = labelled.outline, labelled.far, labelled.small
+        counts.outline = labelled.outline
+        counts.far = labelled.far
+        counts.small = labelled.small
     on_object = apply(frame.world_from_camera, measured[surface])
-    workspace = _workspace(rig, on_object, diameter)
+    workspace = _workspace(rig, on_object, diameter=diameter)
     grid = FreeGrid(workspace, free_resolution)  # there is one view, whatever the rig asks
-    _, small = mark_rays(grid, camera, rig.gate, view, rays)
+    _, small = mark_rays(grid, camera, gate=rig.gate, view=view, usable=rays)
     counts.small += small
     points = KnownPoints(
-        free=outside_of(on_object, grid.new(), free_resolution),
+        free=outside_of(on_object, grid.new(), spacing=free_resolution),
         known=one_per_voxel(on_object, rig.surface_resolution),
     )
     counts.contacts, counts.free = len(points.known), len(points.free)
-    return FramePoints(points, workspace, rays, surface, counts, labelled)
+    return FramePoints(
+        points, workspace, rays=rays, surface=surface, counts=counts, labelled=labelled
+    )
 
 
 def _surface_pixels(
     label: BoolArray,
     view: View,
+    *,
     edges: BoolArray,
     rig: Rig,
     measured: FloatArray,
@@ -206,7 +217,8 @@ def _surface_pixels(
 
     Of these, those in regions that can be the object's; the others are counted by reason.
     """
-    square, valid = np.ones((3, 3), dtype=bool), view.valid
+    square = np.ones((3, 3), dtype=bool)
+    valid = view.valid
     within = binary_erosion(label, square, iterations=LABEL_MARGIN, border_value=1)
     surface = within & valid & ~edges
     if not surface.any():
@@ -214,7 +226,7 @@ def _surface_pixels(
             f"none of the {int(label.sum())} pixels of label is of the surface: outlines "
             "and edges of depth are left out, and pixels out of range"
         )
-    regions = depth_regions(view.metres, surface, view.camera, rig.gate.jump)
+    regions = depth_regions(view.metres, surface, camera=view.camera, jump=rig.gate.jump)
     found = main_regions(
         regions[surface], part=rig.gate.part, points=measured[surface], diameter=diameter
     )
@@ -226,7 +238,7 @@ def _surface_pixels(
     return surface, counts
 
 
-def _workspace(rig: Rig, on_object: FloatArray, diameter: float | None) -> Workspace:
+def _workspace(rig: Rig, on_object: FloatArray, *, diameter: float | None) -> Workspace:
     if rig.workspace is not None:
         return rig.box()
     if len(on_object) == 0 or diameter is None:

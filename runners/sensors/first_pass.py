@@ -81,6 +81,7 @@ class FirstPass:
         self,
         log: RawLog,
         rig: Rig,
+        *,
         sensors: Sequence[TopicReader],
         hand: HandModel | None,
         warnings: LogWarnings,
@@ -103,7 +104,7 @@ class FirstPass:
         }
         self._markers: list[tuple[Received, str]] = []
         clocks = Clocks(rig.clock)
-        for received in log.messages(_topics(log, rig, sensors)):
+        for received in log.messages(_topics(log, rig, sensors=sensors)):
             clocks.add(received)
             self._take(received)
         self.clocks = clocks.correction()
@@ -115,8 +116,9 @@ class FirstPass:
         for text, count in (self.tree.faults + self.joints.faults).items():
             warnings.warn(text, count)
         self._times: dict[str, IntArray] = {
-            topic: np.sort(self.clocks.times(topic, *clocks.of(topic)))
+            topic: np.sort(self.clocks.times(topic, log_times, stamps=stamps))
             for topic in (sensor.topics[0].name for sensor in sensors)
+            for log_times, stamps in (clocks.of(topic),)
         }
         self._check_poses(limits)
         self.windows = self._windows()
@@ -179,20 +181,20 @@ class FirstPass:
             self.warnings.warn("no transform of the log ever changes: the hand has no path")
         for name, frame, _ in frames:
             try:
-                remarks = self.tree.check_motions(rig.world, [frame], limits)
+                remarks = self.tree.check_motions(rig.world, [frame], limits=limits)
             except TransformError as error:
                 raise self.error(f"{name}: {error}") from None
             for remark in remarks:
                 self.warnings.warn(remark)
         for name, frame, times in frames:
-            self._require_known(name, frame, times)
+            self._require_known(name, frame, times=times)
 
-    def _require_known(self, name: str, frame: str, times: IntArray) -> None:
+    def _require_known(self, name: str, frame: str, *, times: IntArray) -> None:
         world, gap = self._rig.world, self._rig.clock.gap
         try:
-            known = self.tree.lookups(world, frame, times, gap_s=gap)[1]
+            known = self.tree.lookups(world, frame, stamps_ns=times, gap_s=gap)[1]
             if not known.any():
-                self.tree.lookup(world, frame, int(times[len(times) // 2]), gap_s=gap)
+                self.tree.lookup(world, frame, stamp_ns=int(times[len(times) // 2]), gap_s=gap)
         except TransformError as error:
             raise self.error(f"{name}: {error}") from None
         lost = int((~known).sum())
@@ -202,7 +204,7 @@ class FirstPass:
         reason = f"{once} was sent once, which counts for {gap:g} s; accepted: on tf_static"
         if not once:
             try:
-                self.tree.lookup(world, frame, int(times[~known][0]), gap_s=gap)
+                self.tree.lookup(world, frame, stamp_ns=int(times[~known][0]), gap_s=gap)
             except TransformError as error:
                 reason = str(error)
         self.warnings.warn(
@@ -219,10 +221,10 @@ class FirstPass:
         last = max([end, *(int(times[-1]) for times in self._times.values())])
         windows: list[ProbeWindow] = []
         if rig.probes is not None:
-            windows = timed_windows(rig.probes, begin, last, warnings)
+            windows = timed_windows(rig.probes, begin, last=last, warnings=warnings)
         elif rig.markers:
             markers = [(self.clocks.time(received), text) for received, text in self._markers]
-            windows = marked_windows(markers, first, last, warnings)
+            windows = marked_windows(markers, first, last=last, warnings=warnings)
             if not windows:
                 warnings.warn(f"topic {rig.markers} marks no probe: the whole log is one")
         return windows or whole_log(first, last)
@@ -236,7 +238,7 @@ class FirstPass:
         return SessionError(f"log {self._log.path}: {text}")
 
 
-def _topics(log: RawLog, rig: Rig, sensors: Sequence[TopicReader]) -> set[str]:
+def _topics(log: RawLog, rig: Rig, *, sensors: Sequence[TopicReader]) -> set[str]:
     """Return the topics to read: those that sensors, the hand and markers need, and transforms.
 
     Raise SessionError if the log lacks one of them.

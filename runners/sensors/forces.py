@@ -42,11 +42,11 @@ class ForceSensor:
     _joints: JointHistory
     _lattice: Lattice
 
-    def __init__(self, rig: ForceRig, resolution: float, hand: HandModel | None) -> None:
+    def __init__(self, rig: ForceRig, resolution: float, *, hand: HandModel | None) -> None:
         """Make the sensor of a hand; one contact a voxel of side `resolution`, metres, is kept."""
         assert hand is not None  # a rig with forces has one
         self.name = rig.topic
-        self.topics = (SensorTopic(rig.topic, WrenchMessage, "forces"),)
+        self.topics = (SensorTopic(rig.topic, WrenchMessage, use="forces"),)
         self.frame = rig.frame
         self._rig = rig
         self._resolution = resolution
@@ -64,7 +64,7 @@ class ForceSensor:
         self._joints = first_pass.joints
         self._lattice = Lattice(cell.free.workspace.lower, self._resolution)
 
-    def take(self, time: int, message: WrenchMessage, counts: Counts, *, within: bool) -> None:
+    def take(self, time: int, message: WrenchMessage, *, counts: Counts, within: bool) -> None:
         """Use a message; `within` a probe's begin and end, forces are of contacts."""
         counts.images += 1
         numbers = np.concatenate([message.force, message.torque])
@@ -78,7 +78,9 @@ class ForceSensor:
             beyond = numbers - self._tare
             newtons = float(np.sqrt((beyond[:3] ** 2).sum()))
             self._largest = max(self._largest, newtons)
-            self._look(_Sample(newtons, time, message.frame, tuple(beyond.tolist())), counts)
+            self._look(
+                _Sample(newtons, time, frame=message.frame, numbers=tuple(beyond.tolist())), counts
+            )
             return
         self._end_row(counts)
         self._idle.append((time, numbers))
@@ -148,8 +150,10 @@ class ForceSensor:
     def _contact(self, sample: _Sample, counts: Counts) -> FloatArray | None:
         """Return where a force acts, and the outward normal (6,), world; None, counted."""
         sensor = self._rig.frame or sample.frame
-        world_from_sensor = self._cell.world_from(sensor, sample.time, self._rig.topic)
-        world_from_hand = self._cell.world_from(self._hand.frame, sample.time, self._rig.topic)
+        world_from_sensor = self._cell.world_from(sensor, sample.time, sensor=self._rig.topic)
+        world_from_hand = self._cell.world_from(
+            self._hand.frame, sample.time, sensor=self._rig.topic
+        )
         if world_from_sensor is None or world_from_hand is None:
             counts.lost += 1
             return None
@@ -167,7 +171,7 @@ class ForceSensor:
         triangles = apply(sensor_from_hand, corners).reshape(-1, 3, 3)
         force, torque = np.array(sample.numbers[:3]), np.array(sample.numbers[3:])
         if self._rig.torque and self._has_torque:
-            found = contact_on_axis(force, torque, triangles)
+            found = contact_on_axis(force, torque, triangles=triangles)
         else:
             found = contact_ahead(force, triangles)
         point = apply(world_from_sensor, found.point[None])

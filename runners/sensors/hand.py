@@ -142,7 +142,7 @@ def _robot(path: Path, where: str) -> Any:
             f"{where} needs the package yourdfpy; install it where the project is: "
             "pip install -e '.[sensors]'"
         ) from None
-    refuse_special_file(where, path, SettingError)
+    refuse_special_file(where, path, error=SettingError)
     content = path.read_bytes()
     if b"<xacro:" in content:
         raise SettingError(f"{where} holds xacro macros; accepted: what the tool xacro makes")
@@ -181,7 +181,7 @@ def _mesh_file(fname: str, folder: Path) -> str:
     for parent in (folder, *folder.parents):
         for path in (parent / name, parent / name.partition("/")[2]):
             if path.is_file():
-                refuse_special_file(f"mesh {path}", path, SettingError)
+                refuse_special_file(f"mesh {path}", path, error=SettingError)
                 return str(path)
     raise FileNotFoundError(f"mesh {fname} does not exist in or above {folder}")
 
@@ -190,10 +190,19 @@ class HandPath:
     """The path of the hand, probe by probe, and the free space that follows."""
 
     def __init__(
-        self, rig: HandRig, model: HandModel, joints: JointHistory, times: IntArray, cell: RobotCell
+        self,
+        rig: HandRig,
+        model: HandModel,
+        *,
+        joints: JointHistory,
+        times: IntArray,
+        cell: RobotCell,
     ) -> None:
         """Make the path of a hand; times (T,): of all transforms, nanoseconds, ascending."""
-        self._frame, self._model, self._joints, self._times = rig.frame, model, joints, times
+        self._frame = rig.frame
+        self._model = model
+        self._joints = joints
+        self._times = times
         self._cell = cell
         self._reaches = False  # whether its solids reach the workspace
         self._filled: dict[bytes, FloatArray] = {}  # points in each part, by its vertices
@@ -211,7 +220,7 @@ class HandPath:
                 continue
             interior = self._interior(joints)
             reach = float(np.sqrt((interior**2).sum(axis=1).max(initial=0.0)))
-            for poses in self._runs(begin, end, counts):
+            for poses in self._runs(begin, end, counts=counts):
                 # No interior point moves by more than half a voxel from one pose to the next.
                 dense = poses_between(poses, step=0.5 * self._cell.spacing, radius=reach)
                 if len(interior):
@@ -236,7 +245,7 @@ class HandPath:
         lower, upper = self._cell.free.workspace.bounds
         return bool(((places > lower - reach) & (places < upper + reach)).all(axis=1).any())
 
-    def _runs(self, begin: int, end: int, counts: Counts) -> Iterator[FloatArray]:
+    def _runs(self, begin: int, end: int, *, counts: Counts) -> Iterator[FloatArray]:
         """Yield poses (P, 4, 4) from a time to before another, cut at gaps and jumps."""
         times = self._times[slice(*np.searchsorted(self._times, (begin, end)))]
         cell = self._cell
@@ -244,7 +253,9 @@ class HandPath:
         for start in range(0, len(times), _BATCH):
             # One pose of the batch before, so that nothing is missing between them.
             stamps = times[max(start - 1, 0) : start + _BATCH]
-            poses, known = cell.tree.lookups(cell.world, self._frame, stamps, gap_s=cell.gap)
+            poses, known = cell.tree.lookups(
+                cell.world, self._frame, stamps_ns=stamps, gap_s=cell.gap
+            )
             counts.images += len(stamps)
             counts.used += int(known.sum())
             counts.lost += int(len(stamps) - known.sum())

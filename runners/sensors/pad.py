@@ -42,7 +42,7 @@ REACH = 0.1  # m: of the membrane from its camera, for how far a turn moves it
 
 
 def membrane_reference(
-    rig: BubbleRig, samples: list[np.ndarray], camera: PinholeCamera, beside: Path
+    rig: BubbleRig, samples: list[np.ndarray], *, camera: PinholeCamera, beside: Path
 ) -> FloatArray:
     """Return depth (H, W) of a pad's untouched membrane, metres, 0 where it is not known.
 
@@ -135,10 +135,10 @@ class Pad:
             self._rig, untouched, camera=self._camera, beside=first_pass.folder
         )
 
-    def take(self, time: int, message: ImageMessage, counts: Counts, *, within: bool) -> None:
+    def take(self, time: int, message: ImageMessage, *, counts: Counts, within: bool) -> None:
         """Use an image of the current probe; `within` its begin and end, contacts count."""
         counts.images += 1
-        imprint = self._imprint(time, message, counts)
+        imprint = self._imprint(time, message, counts=counts)
         if imprint is None:
             return
         moved = self._has_moved(imprint.view.world_from_camera)
@@ -172,8 +172,15 @@ class Pad:
     def _image(self, step: int, imprint: Imprint) -> SensorImage:
         """Return the deformation with the pixels in contact."""
         valid = imprint.view.valid & (imprint.pressed > 0.0)
-        pressed = View(imprint.pressed, valid, self._camera, imprint.view.world_from_camera)
-        return recorded_image(step, self.name, "deformation", pressed, imprint.touching)
+        pressed = View(
+            imprint.pressed,
+            valid,
+            camera=self._camera,
+            world_from_camera=imprint.view.world_from_camera,
+        )
+        return recorded_image(
+            step, self.name, kind="deformation", view=pressed, mask=imprint.touching
+        )
 
     def _contacts(self, imprint: Imprint) -> FloatArray:
         """Return points and outward normals of the object (C, 6) at the contact pixels, world."""
@@ -184,8 +191,10 @@ class Pad:
         pose = view.world_from_camera
         return np.concatenate([apply(pose, points), rotated(pose[:3, :3], normals)], axis=1)
 
-    def _imprint(self, time: int, message: ImageMessage, counts: Counts) -> Imprint | None:
-        view = view_of(message, time, self._rig, self._camera, self._cell, counts)
+    def _imprint(self, time: int, message: ImageMessage, *, counts: Counts) -> Imprint | None:
+        view = view_of(
+            message, time, rig=self._rig, camera=self._camera, cell=self._cell, counts=counts
+        )
         if view is None:
             return None
         known = self._reference > 0.0
@@ -195,11 +204,12 @@ class Pad:
             depth = self._reference - pressed
             nearest, furthest = self._rig.range
             valid = measured & (depth >= nearest) & (depth <= furthest)
-            kept = self._main(depth, valid, counts)
+            kept = self._main(depth, valid, counts=counts)
             pressed[valid & ~kept] = 0.0
-            valid, view = kept, View(depth, kept, self._camera, view.world_from_camera)
+            valid = kept
+            view = View(depth, kept, camera=self._camera, world_from_camera=view.world_from_camera)
         else:
-            valid = self._main(view.metres, view.valid & known, counts)
+            valid = self._main(view.metres, view.valid & known, counts=counts)
             pressed = deformation(self._reference, view.metres, valid=valid)
         if not valid.any():
             counts.unusable += 1
@@ -210,18 +220,18 @@ class Pad:
         touching = contact_mask(
             pressed, quantile=contact.quantile, threshold=contact.threshold, valid=valid
         )
-        touching = self._main(view.metres, touching, counts, least=contact.pixels)
-        return Imprint(view, pressed, touching)
+        touching = self._main(view.metres, touching, counts=counts, least=contact.pixels)
+        return Imprint(view, pressed, touching=touching)
 
     def _main(
-        self, depth: FloatArray, usable: BoolArray, counts: Counts, *, least: int = 0
+        self, depth: FloatArray, usable: BoolArray, *, counts: Counts, least: int = 0
     ) -> BoolArray:
         """Return those of pixels (H, W) in regions without a jump of depth that are not too small.
 
         least: pixels of a region.
         """
         gate = self._cell.gate
-        regions = depth_regions(depth, usable, self._camera, gate.jump)
+        regions = depth_regions(depth, usable, camera=self._camera, jump=gate.jump)
         kept = usable & ~small_regions(regions, least)
         kept[kept] = main_regions(regions[kept], part=gate.part).kept
         counts.small += int((usable & ~kept).sum())
@@ -230,9 +240,10 @@ class Pad:
     def _mark(self, view: View, counts: Counts) -> None:
         """Mark the pad's inside as free, less half a voxel's diagonal before what it may touch."""
         depth = view.metres - sqrt(0.75) * self._cell.spacing / self._lengths
-        inside, pose = view.valid & (depth > 0.0), view.world_from_camera
+        inside = view.valid & (depth > 0.0)
+        pose = view.world_from_camera
         counts.free += self._cell.free.grid.from_depth(
-            depth, self._camera, pose, inside, fraction=1.0
+            depth, self._camera, world_from_camera=pose, mask=inside, fraction=1.0
         )
 
     def _has_moved(self, pose: FloatArray) -> bool:

@@ -36,7 +36,7 @@ _Loader.add_implicit_resolver(
 
 def read_yaml(path: Path) -> dict[Any, Any]:
     """Return the mapping in a file. Raise SessionError, its text without the file's name."""
-    refuse_special_file("it", path, SessionError)
+    refuse_special_file("it", path, error=SessionError)
     try:
         values = yaml.load(path.read_bytes(), _Loader)
     except OSError as error:
@@ -65,13 +65,13 @@ def read_pose(path: str | Path) -> FloatArray:
 
 def pose_of_rows(name: str, rows: Any) -> FloatArray:
     """Return a rigid transform (4, 4) of a file; its rotation, of few digits, is made exact."""
-    pose = nearest_rigid(name, frozen(name, rows, (4, 4), error=SessionError)[None])[0]
+    pose = nearest_rigid(name, frozen(name, rows, shape=(4, 4), error=SessionError)[None])[0]
     pose.setflags(write=False)
     return pose
 
 
 def write_pose(
-    path: Path, world_from_object: FloatArray, about: Mapping[str, Any], *, overwrite: bool = False
+    path: Path, world_from_object: FloatArray, *, about: Mapping[str, Any], overwrite: bool = False
 ) -> None:
     """Write a pose (4, 4), and what a person may want to know about it, plain values.
 

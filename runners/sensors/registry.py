@@ -21,7 +21,7 @@ def sensors_of(rig: Rig, hand: HandModel | None) -> list[Sensor]:
         *(DepthCamera(camera) for camera in rig.cameras),
         *(Pad(pad, rig.contact) for pad in rig.bubbles),
         *(Cloud(cloud, rig.surface_resolution) for cloud in rig.clouds),
-        *(ForceSensor(force, rig.surface_resolution, hand) for force in rig.forces),
+        *(ForceSensor(force, rig.surface_resolution, hand=hand) for force in rig.forces),
     ]
     if not sensors and hand is None:
         raise SettingError(

@@ -24,7 +24,7 @@ def _fits(accepted: str, is_accepted: Callable[[Any], bool]) -> Check:
 
 def _points(name: str, value: Any) -> None:
     """Raise SettingError unless a value is finite points (N, 3)."""
-    frozen(name, value, (None, 3), error=SettingError)
+    frozen(name, value, shape=(None, 3), error=SettingError)
 
 
 Vector = tuple[float, float, float]
@@ -111,7 +111,7 @@ class BoxRig:
         for side in self.size:
             positive("size", side)
         for name in ("position", "rotation"):
-            frozen(name, getattr(self, name), (3,), error=SettingError)
+            frozen(name, getattr(self, name), shape=(3,), error=SettingError)
 
 
 @dataclass(frozen=True)

@@ -29,10 +29,10 @@ class SecondPass:
         self,
         rig: Rig,
         sensors: Sequence[Sensor],
+        *,
         hand: HandPath | None,
         cell: RobotCell,
         report: Report,
-        *,
         seed: int,
         images: bool,
     ) -> None:
@@ -58,7 +58,7 @@ class SecondPass:
             for name in names:
                 self._report.counts(window.step, name)  # in this order they are shown
             while message is not None and message[0] < window.closes:
-                self._take(window, message[0], message[1])
+                self._take(window, message[0], message=message[1])
                 message = next(messages, None)
             yield from self._finish(window)
 
@@ -75,7 +75,7 @@ class SecondPass:
             if text:
                 self._cell.warnings.warn(f"{name}: {text}")
 
-    def _take(self, window: ProbeWindow, time: int, message: Received) -> None:
+    def _take(self, window: ProbeWindow, time: int, *, message: Received) -> None:
         """Give a message to the sensors that read its topic."""
         if time < window.opens:
             self._cell.warnings.warn(f"{message.topic}: left out, as it came long after its probe")
@@ -84,7 +84,7 @@ class SecondPass:
             topic = sensor.topics[0]
             if topic.name == message.topic and isinstance(message.content, topic.content):
                 counts = self._report.counts(window.step, sensor.name)
-                sensor.take(time, message.content, counts, within=window.holds(time))
+                sensor.take(time, message.content, counts=counts, within=window.holds(time))
 
     def _finish(self, window: ProbeWindow) -> Iterator[Event]:
         """Yield the events at the end of a probe."""
@@ -118,11 +118,11 @@ class SecondPass:
         )
         if self._images:
             yield from (each.image for each in sensed.values() if each.image is not None)
-        yield Logged(step, "info", _summary(step, new, by_sensor))
+        yield Logged(step, "info", text=_summary(step, new, by_sensor=by_sensor))
         yield Probe(
             step,
             "contact" if len(touched) else "free",
-            new,
+            new_points=new,
             gripper_path=path,
             contacts=touched[:, :3],
             contact_normals=touched[:, 3:],
@@ -139,7 +139,7 @@ class SecondPass:
         for index, (name, points) in enumerate(candidates.items()):
             stream = key.stream(Purpose.CONTACT_POINTS, index)
             contacts = self._within(
-                name, points[contact_subset(len(points), shares[index], stream)]
+                name, points[contact_subset(len(points), shares[index], stream=stream)]
             )
             self._report.counts(step, name).contacts += len(contacts)
             drawn.append(contacts)
@@ -164,7 +164,7 @@ class SecondPass:
         return contacts[kept]
 
 
-def _summary(step: int, new: KnownPoints, by_sensor: Mapping[str, Counts]) -> str:
+def _summary(step: int, new: KnownPoints, *, by_sensor: Mapping[str, Counts]) -> str:
     """Return the result of a probe in one line."""
     free = ", ".join(f"{name} {counts.free}" for name, counts in by_sensor.items() if counts.free)
     surface = ", ".join(

@@ -57,7 +57,7 @@ class Sensor(TopicReader, Protocol):
         Raise SessionError for a log that lacks what the sensor needs.
         """
 
-    def take(self, time: int, message: Any, counts: Counts, *, within: bool) -> None:
+    def take(self, time: int, message: Any, *, counts: Counts, within: bool) -> None:
         """Use a message of the current probe, nanoseconds; within: its begin and end."""
 
     def finish(self, step: int, counts: Counts) -> Sensed:

@@ -62,7 +62,7 @@ def parsed(body: bytes) -> Json:
 
 def open_session(body: bytes, folder: Path) -> tuple[Session, Json]:
     """Return a new session, recorded in the folder, and the answer to its client."""
-    request = build_settings(OpenRequest, parsed(body), "open")
+    request = build_settings(OpenRequest, parsed(body), where="open")
     arguments = dict(vars(request))
     if not isinstance(request.target, str):  # whose path also names the object
         arguments["target"] = _mesh("target", request.target)
@@ -136,12 +136,12 @@ REQUESTS: dict[str, tuple[Callable[[Session, Json], Json], tuple[str, ...]]] = {
 """The function that answers a request to a session, and the names that the request may have."""
 
 
-def answered(request: str, session: Session, body: bytes) -> Json:
+def answered(request: str, session: Session, *, body: bytes) -> Json:
     """Return the answer to one of REQUESTS."""
     answer, accepted = REQUESTS[request]
     values = parsed(body)
     for name in values:
-        require_choice(f"a name in {request}", name, accepted or ["no names"])
+        require_choice(f"a name in {request}", name, accepted=accepted or ["no names"])
     return answer(session, values)
 
 

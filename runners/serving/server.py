@@ -70,16 +70,20 @@ class Server:
                 raise web.HTTPUnauthorized(text=text)
             answer = await handler(request)
         except ChselError as error:
-            status, answer = 400, {"error": one_line(error)}
+            status = 400
+            answer = {"error": one_line(error)}
         except web.HTTPException as error:  # also of aiohttp, such as 404 for an unknown path
-            status, answer = error.status, {"error": error.text}
+            status = error.status
+            answer = {"error": error.text}
         except (ConnectionError, web.RequestPayloadError):  # nobody may be there to read this
             status, answer = 400, {"error": "the body is cut; accepted: as long as it says"}
         except OSError as error:  # of a file that a request names
-            status, answer = 400, {"error": one_line(error)}
+            status = 400
+            answer = {"error": one_line(error)}
         except Exception as error:
             traceback.print_exc()
-            status, answer = 500, {"error": one_line(error)}
+            status = 500
+            answer = {"error": one_line(error)}
         return web.json_response(messages.plain(answer), status=status)
 
     async def _list(self, _: web.Request) -> Any:
@@ -94,7 +98,7 @@ class Server:
         session, about = messages.open_session(body, self._folder)
         self._count += 1
         about = {"session": str(self._count), **about}
-        self._served[about["session"]] = _Served(session, ThreadPoolExecutor(1), about)
+        self._served[about["session"]] = _Served(session, ThreadPoolExecutor(1), about=about)
         return about
 
     async def _ask(self, request: web.Request) -> Any:
@@ -110,9 +114,9 @@ class Server:
             served.thread.shutdown(wait=False)
         return answer
 
-    def _asked(self, verb: str, session: Session, body: bytes) -> messages.Json:
+    def _asked(self, verb: str, session: Session, body: bytes) -> messages.Json:  # noqa: PLR0917
         self._check_open()
-        return messages.answered(verb, session, body)
+        return messages.answered(verb, session, body=body)
 
     def _check_open(self) -> None:
         """Raise HTTPServiceUnavailable if the server ends, for a request that waited."""
@@ -138,7 +142,8 @@ class Server:
 
 async def _body(request: web.Request) -> bytes:
     """Return the body of a request, unpacked; raise SettingError if that cannot be done."""
-    body, encoding = await request.read(), request.headers.get("Content-Encoding", "").lower()
+    body = await request.read()
+    encoding = request.headers.get("Content-Encoding", "").lower()
     if encoding in ("", "identity"):
         return body
     if encoding not in ("gzip", "deflate"):

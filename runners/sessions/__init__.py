@@ -25,7 +25,7 @@ KINDS: Mapping[str, SourceKind] = {
 
 def source_kind(name: Any) -> SourceKind:
     """Return the kind of this name. Raise SettingError if there is none."""
-    require_choice("session.kind", name, KINDS)
+    require_choice("session.kind", name, accepted=KINDS)
     return KINDS[name]
 
 
@@ -36,11 +36,11 @@ def kinds_of(origin: ObjectOrigin) -> tuple[str, ...]:
 
 def session_settings(kind: str, config: Mapping[str, Any]) -> Any:
     """Return the checked settings of a source of this kind."""
-    return build_settings(source_kind(kind).settings, config, "session")
+    return build_settings(source_kind(kind).settings, config, where="session")
 
 
 def open_source(
-    kind: str, settings: Any, object_model: ObjectModel | None, seed: int
+    kind: str, settings: Any, *, object_model: ObjectModel | None, seed: int
 ) -> ProbeSource:
     """Open a source with settings from `session_settings`; see `SourceKind.open`."""
     return source_kind(kind).open(settings, object_model, seed)

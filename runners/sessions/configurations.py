@@ -41,8 +41,11 @@ class Configuration:
         return [(y, z) for y in self.y for z in self.z]
 
 
-_DRILL_Y, _DRILL_Z = (0.0, 0.2, 0.3, -0.2, -0.3), (0.05, 0.15, 0.25, 0.4, 0.51)
-_AS_MODELLED, _TURNED, _FALLEN = (0.0, 0.0, 0.0), (0.0, 0.0, pi / 2.0), (pi / 2.0, 0.0, 0.2)
+_DRILL_Y = (0.0, 0.2, 0.3, -0.2, -0.3)
+_DRILL_Z = (0.05, 0.15, 0.25, 0.4, 0.51)
+_AS_MODELLED = (0.0, 0.0, 0.0)
+_TURNED = (0.0, 0.0, pi / 2.0)
+_FALLEN = (pi / 2.0, 0.0, 0.2)
 
 _GRIDS = {
     "drill": (_DRILL_Y, (0.05, 0.15, 0.25, 0.325, 0.4, 0.5)),
@@ -107,5 +110,5 @@ def find_configuration(name: str, object_name: str | None = None) -> Configurati
     is not accepted.
     """
     fitting = [key for key, one in CONFIGURATIONS.items() if one.object == object_name]
-    require_choice("configuration", name, [*(fitting or CONFIGURATIONS), FITTED])
+    require_choice("configuration", name, accepted=[*(fitting or CONFIGURATIONS), FITTED])
     return CONFIGURATIONS[name]

@@ -27,7 +27,7 @@ _NEIGHBOURS = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1
 _OF_SESSION, _OF_NOISE, _OF_FOREIGN, _OF_FREE = range(4)
 
 
-def number_between(low: float, high: float, unit: str = "") -> Check:
+def number_between(low: float, high: float, *, unit: str = "") -> Check:
     """Return the check of a number from `low` to `high`."""
 
     def check(name: str, value: Any) -> None:
@@ -114,6 +114,7 @@ class Faults:
         self,
         settings: FaultSettings,
         mesh: trimesh.Trimesh,
+        *,
         world_from_object: FloatArray,
         free: FreeVoxels,
         workspace: Workspace,
@@ -123,17 +124,19 @@ class Faults:
 
         mesh: the probed one, metres, at world_from_object (4, 4). free: of the session.
         """
-        self._settings, self._mesh, self._seed = settings, mesh, seed
+        self._settings = settings
+        self._mesh = mesh
+        self._seed = seed
         self.object_from_world = inverse(world_from_object)  # changes where pushes move it
         self._free, self._workspace = free, workspace
         stream = StreamKey(seed, 0).stream(Purpose.FAULTS, _OF_SESSION)
         self._bias = settings.camera_bias * _directions(stream, 1)[0]  # (3,), world
-        self._phase = float(uniforms(stream, 0.0, 1.0, 1)[0])
+        self._phase = float(uniforms(stream, 0.0, upper=1.0, shape=1)[0])
         self._true = self._foreign = 0  # numbers of contacts so far
         self._drawn: set[bytes] = set()  # voxels inside the object that had their chance
 
     def reported(
-        self, step: int, contacts: FloatArray, normals_out: FloatArray
+        self, step: int, contacts: FloatArray, *, normals_out: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return contacts (C', 3) and normals (C', 3) reported of true ones (C, 3); true first."""
         places, others = self._foreign_contacts(step, contacts)
@@ -162,7 +165,7 @@ class Faults:
         new = np.array([voxel.tobytes() not in self._drawn for voxel in voxels], dtype=bool)
         voxels = voxels[new]
         self._drawn.update(voxel.tobytes() for voxel in voxels)
-        chance = uniforms(self._stream(step, _OF_FREE), 0.0, 1.0, len(voxels))
+        chance = uniforms(self._stream(step, _OF_FREE), 0.0, upper=1.0, shape=len(voxels))
         return self._free.add(lattice.centres(voxels[chance < self._settings.free_error]))
 
     def _foreign_contacts(self, step: int, contacts: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -171,7 +174,8 @@ class Faults:
         Their share is kept over the session, not drawn for every contact. Where no place fits, the
         contact comes with the next true one.
         """
-        share, stream = self._settings.foreign_contacts, self._stream(step, _OF_FOREIGN)
+        share = self._settings.foreign_contacts
+        stream = self._stream(step, _OF_FOREIGN)
         found: list[FloatArray] = []
         for contact in contacts:
             self._true += 1
@@ -185,7 +189,7 @@ class Faults:
 
     def _place_beside(self, contact: FloatArray, stream: np.random.Generator) -> FloatArray | None:
         """Return a point (3,) off the object in no voxel reported free; None if none was found."""
-        away = uniforms(stream, _NEAREST, self._settings.foreign_reach, (_TRIES, 1))
+        away = uniforms(stream, _NEAREST, upper=self._settings.foreign_reach, shape=(_TRIES, 1))
         places = contact + away * _directions(stream, _TRIES)
         lower, upper = self._workspace.bounds
         fitting = ((places >= lower) & (places <= upper)).all(axis=1) & ~self._free.holds(places)
@@ -194,7 +198,8 @@ class Faults:
 
     def _in_bounds(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
         """Return which points (N, 3) are in the probed mesh's bounding box, padded by a margin."""
-        in_object, (lower, upper) = apply(self.object_from_world, points), self._mesh.bounds
+        in_object = apply(self.object_from_world, points)
+        (lower, upper) = self._mesh.bounds
         inside: BoolArray = (in_object >= lower - margin).all(axis=1)
         inside &= (in_object <= upper + margin).all(axis=1)
         return inside

@@ -48,7 +48,8 @@ def fitted_configuration(mesh: trimesh.Trimesh, hand: ProbingHand) -> Configurat
     bottom = (*around.lower[:2], stand - _BELOW * FREE_RESOLUTION)
     # The hand meets the object as long as their boxes overlap.
     first, last = lower - foremost[1], upper - foremost[0]
-    middle, half = 0.5 * (first + last), 0.5 * (last - first)
+    middle = 0.5 * (first + last)
+    half = 0.5 * (last - first)
     return replace(
         flat,
         y=tuple(float(middle[1] + share * half[1]) for share in _ACROSS),

@@ -75,7 +75,7 @@ class SimulatedGripper:
     normals: list[FloatArray]
     """Outward normals (3,) of the object at the contacts."""
 
-    def __init__(self, engine: Engine, settings: ProbingSettings, seed: int) -> None:
+    def __init__(self, engine: Engine, settings: ProbingSettings, *, seed: int) -> None:
         self._engine = engine
         self._settings = settings
         stream = StreamKey(seed, 0).stream(Purpose.CONTROL_NOISE)
@@ -151,7 +151,8 @@ class SimulatedGripper:
         """Follow a command (3,) within [-1, 1]; the median force over mini-steps, newtons."""
         noisy = np.clip(command + self._noise[self._steps % NOISE_ROWS], -1.0, 1.0)
         self._steps += 1
-        start, displacement = self._position, self._settings.step_length * noisy
+        start = self._position
+        displacement = self._settings.step_length * noisy
         forces = []
         for mini_step in range(MINI_STEPS):
             fraction = (mini_step + 1) / MINI_STEPS

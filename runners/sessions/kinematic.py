@@ -28,6 +28,7 @@ class KinematicEngine:
         self,
         mesh: trimesh.Trimesh,
         world_from_object: FloatArray,
+        *,
         settings: ProbingSettings,
         hand: ProbingHand,
     ) -> None:
@@ -65,15 +66,17 @@ class KinematicEngine:
                 if len(points) > 0:
                     points = points[self._object.closest(points + target)[0] <= 0.0]
                 if len(points) > 0:
-                    return self._touch(points, motion, length)
+                    return self._touch(points, motion, length=length)
         self._position = target
         return Touch(target)
 
     def place(self, pose: FloatArray) -> bool:
         """Put the hand at a pose (4, 4); False, and not to be used, if the object is there."""
-        turn, position = turned_from_forward(pose[:3, :3]), pose[:3, 3]
+        turn = turned_from_forward(pose[:3, :3])
+        position = pose[:3, 3]
         if not (turn == self._turn).all():
-            self._turn, self._patches = turn, self._forward.turned(turn)
+            self._turn = turn
+            self._patches = self._forward.turned(turn)
         self._position = position
         patches = self._patches
         self._clearance = self._object.distance(patches.centres + position) - patches.radii
@@ -84,9 +87,11 @@ class KinematicEngine:
     def close(self) -> None:
         """Release nothing, as nothing is held."""
 
-    def _touch(self, points: FloatArray, motion: FloatArray, length: float) -> Touch:
+    def _touch(self, points: FloatArray, motion: FloatArray, *, length: float) -> Touch:
         """Bisect for when the first of points (S, 3) gets in; at the end of the way all are in."""
-        start, free, blocked = self._position, 0.0, 1.0
+        start = self._position
+        free = 0.0
+        blocked = 1.0
         while (blocked - free) * length > PRECISION:
             middle = 0.5 * (free + blocked)
             inside = self._object.closest(points + start + middle * motion)[0] <= 0.0
@@ -99,7 +104,7 @@ class KinematicEngine:
         self._clearance -= (1.0 - free) * length
         distance, contacts, normals = self._object.closest(points + self._position)
         first = int(np.argmin(distance))
-        return Touch(self._position, self._force, contacts[first], normals[first])
+        return Touch(self._position, self._force, contact=contacts[first], normal=normals[first])
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +130,7 @@ def _patches(hand: ProbingHand) -> _Patches:
     centres = np.stack([np.bincount(labels, axis) / count for axis in points.T], axis=1)
     radii = np.zeros(len(centres))
     np.maximum.at(radii, labels, np.sqrt(((points - centres[labels]) ** 2).sum(axis=1)))
-    return _Patches(points, labels, centres, radii)
+    return _Patches(points, labels, centres=centres, radii=radii)
 
 
 class _Surface:

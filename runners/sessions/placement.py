@@ -60,7 +60,8 @@ def roll_to_rest(mesh: trimesh.Trimesh, world_from_object: FloatArray) -> FloatA
     Raise SessionError if it never comes to rest.
     """
     vertices = np.asarray(mesh.convex_hull.vertices, dtype=np.float64)
-    rotation, translation = world_from_object[:3, :3], world_from_object[:3, 3].copy()
+    rotation = world_from_object[:3, :3]
+    translation = world_from_object[:3, 3].copy()
     centre = centre_of_mass(mesh)
     for _ in range(_MOST_ROLLS):
         placed = vertices @ rotation.T + translation
@@ -71,13 +72,14 @@ def roll_to_rest(mesh: trimesh.Trimesh, world_from_object: FloatArray) -> FloatA
         away = weight[:2] - pivot
         if np.sqrt(away @ away) < _FLAT:
             return compose(rotation, translation)
-        turn, pivot3 = _tilt(placed, pivot, away), np.array([*pivot, 0.0])
+        turn = _tilt(placed, pivot, away=away)
+        pivot3 = np.array([*pivot, 0.0])
         rotation = turn @ rotation
         translation = turn @ (translation - pivot3) + pivot3
     raise SessionError(f"the object does not come to rest within {_MOST_ROLLS} rolls")
 
 
-def _tilt(placed: FloatArray, pivot: FloatArray, away: FloatArray) -> FloatArray:
+def _tilt(placed: FloatArray, pivot: FloatArray, *, away: FloatArray) -> FloatArray:
     """Return the rotation (3, 3) that tilts vertices (V, 3) over a pivot to the next vertex."""
     direction = away / np.sqrt(away @ away)
     distance = (placed[:, :2] - pivot) @ direction
@@ -97,7 +99,8 @@ def _nearest_support(support: FloatArray, point: FloatArray) -> FloatArray:
     except (QhullError, ValueError):  # one point, or all on a line
         widest = int(np.argmax(np.ptp(support, axis=0)))
         corners = support[[np.argmin(support[:, widest]), np.argmax(support[:, widest])]]
-    start, side = corners, np.roll(corners, -1, axis=0) - corners
+    start = corners
+    side = np.roll(corners, -1, axis=0) - corners
     length = np.maximum((side**2).sum(axis=1), 1e-30)
     along = np.clip(((point - start) * side).sum(axis=1) / length, 0.0, 1.0)
     nearest = start + along[:, None] * side

@@ -90,7 +90,9 @@ class PointsSource(ProbeSource):
         every = KnownPoints()
         diameter = object_model.diameter
         for step in self._steps:
-            points, repeated = distinct_points(self._file.at(step), every, same_place(diameter))
+            points, repeated = distinct_points(
+                self._file.at(step), every, apart=same_place(diameter)
+            )
             every = every.merged(points)
             self._points.append(points)
             self.warnings += repeated
@@ -99,25 +101,29 @@ class PointsSource(ProbeSource):
             (x0, x1), (y0, y1), (z0, z1) = settings.workspace
             given = Workspace((x0, y0, z0), (x1, y1, z1))
         try:  # before any work; warnings are given when the points become known
-            check_points(every, diameter, self.free_resolution, given)
+            check_points(every, diameter, free_resolution=self.free_resolution, workspace=given)
             if given is not None:
                 self.warnings += check_workspace(given, diameter)
         except PointsError as error:
             raise PointsError(f"point file {settings.path}: {error}") from None
-        self.warnings += check_places("the nearest point", every.all_points(), diameter, given)
+        self.warnings += check_places(
+            "the nearest point", every.all_points(), diameter=diameter, workspace=given
+        )
         self.workspace = given or workspace_around(every, object_model.grid(settings))
 
     def probes(self) -> Iterator[Probe]:
         """Yield one probe per step of the file."""
         for step, points in zip(self._steps, self._points, strict=True):
             contacts = self._file.at(step).contacts
-            yield Probe(step, "points", points, contacts=contacts, contact_normals=0.0 * contacts)
+            yield Probe(
+                step, "points", new_points=points, contacts=contacts, contact_normals=0.0 * contacts
+            )
 
     def close(self) -> None:
         """Release nothing, as nothing is held open."""
 
 
-def open_points(
+def open_points(  # noqa: PLR0917
     settings: PointsSettings, object_model: ObjectModel | None, seed: int
 ) -> PointsSource:
     """Open the source of a file, whatever the seed. Raise PointsError for unusable points."""
@@ -125,7 +131,7 @@ def open_points(
     return PointsSource(settings, object_model)
 
 
-POINTS = SourceKind(PointsSettings, open_points, ObjectOrigin.REAL)
+POINTS = SourceKind(PointsSettings, open_points, object=ObjectOrigin.REAL)
 
 
 KINDS = ("surface", *POINT_CLASSES)
@@ -150,7 +156,9 @@ class PointFile:
         )
         known = np.concatenate([surface, known])
         points = self.points
-        return KnownPoints(points[free], points[occupied], points[known], self.sdf[known])
+        return KnownPoints(
+            points[free], points[occupied], known=points[known], known_sdf=self.sdf[known]
+        )
 
 
 def read_points(path: str | Path) -> PointFile:
@@ -166,7 +174,7 @@ def read_points(path: str | Path) -> PointFile:
         )
     if not path.is_file():
         raise PointsError(f"point file {path} does not exist; accepted: a file")
-    refuse_special_file(f"point file {path}", path, PointsError)
+    refuse_special_file(f"point file {path}", path, error=PointsError)
     try:
         content = reader(path)
         if len(content.points) == 0:
@@ -190,18 +198,20 @@ def _read_npz(path: Path) -> PointFile:
         raise PointsError("known and known_sdf stand only together")
     pose = arrays.get("world_from_object")
     if pose is not None:
-        pose = frozen("world_from_object", pose, (4, 4), error=PoseError)
+        pose = frozen("world_from_object", pose, shape=(4, 4), error=PoseError)
         pose = nearest_rigid("world_from_object", pose[None])[0]
     parts = [_npz_part(kind, arrays) for kind in given]
     kinds, points, sdf, steps = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return PointFile(kinds, points, sdf, steps, pose)
+    return PointFile(kinds, points, sdf=sdf, steps=steps, world_from_object=pose)
 
 
 def _npz_part(kind: str, arrays: dict[str, Any]) -> tuple[np.ndarray, ...]:
     """Return kinds, points, signed distances and steps of one array of points."""
-    points = frozen(kind, arrays[kind], (None, 3))
+    points = frozen(kind, arrays[kind], shape=(None, 3))
     nothing = np.zeros(len(points), dtype=np.int64)
-    sdf = frozen("known_sdf", arrays["known_sdf"] if kind == "known" else nothing, nothing.shape)
+    sdf = frozen(
+        "known_sdf", arrays["known_sdf"] if kind == "known" else nothing, shape=nothing.shape
+    )
     steps = np.asarray(arrays.get(f"{kind}_step", nothing))
     if not np.issubdtype(steps.dtype, np.integer) or steps.shape != nothing.shape:
         raise PointsError(
@@ -227,13 +237,16 @@ def _read_csv(path: Path) -> PointFile:
         table["kind"] = "surface"
     table = table.reindex(columns=_COLUMNS)
     kinds = table.pop("kind").astype(str).str.strip().to_numpy()
-    known, given = kinds == "known", table["sdf"].notna().to_numpy()
+    known = kinds == "known"
+    given = table["sdf"].notna().to_numpy()
     table = table.fillna({"sdf": 0.0, "step": 0.0})
     try:
         numbers = table.to_numpy(float)
     except ValueError:
         raise PointsError(_not_a_number(table)) from None
-    points, sdf, steps = numbers[:, :3], numbers[:, 3], numbers[:, 4]
+    points = numbers[:, :3]
+    sdf = numbers[:, 3]
+    steps = numbers[:, 4]
     for wrong, what in (
         (~np.isin(kinds, KINDS), f"kind is none of {', '.join(KINDS)}"),
         (~np.isfinite(numbers).all(axis=1), "one of x, y, z, sdf and step is not a finite number"),
@@ -246,7 +259,7 @@ def _read_csv(path: Path) -> PointFile:
     if not with_kind:
         text = f"point file {path} has no column kind: its points are read as points on the object"
         warnings.warn(PointsWarning("kind", text), stacklevel=2)
-    return PointFile(kinds, points, sdf, steps.astype(np.int64))
+    return PointFile(kinds, points, sdf=sdf, steps=steps.astype(np.int64))
 
 
 def _wrong_length(path: Path) -> str:
@@ -289,9 +302,11 @@ def _read_surface(path: Path) -> PointFile:
         vertices = np.concatenate([_vertices(geometry) for geometry in geometries])
     except Exception as error:  # readers of foreign formats raise anything
         raise PointsError(_unreadable(f".{kind}", error)) from None
-    points = frozen("surface", vertices, (None, 3))
+    points = frozen("surface", vertices, shape=(None, 3))
     nothing = np.zeros(len(points), dtype=np.int64)
-    return PointFile(np.full(len(points), "surface"), points, nothing.astype(float), nothing)
+    return PointFile(
+        np.full(len(points), "surface"), points, sdf=nothing.astype(float), steps=nothing
+    )
 
 
 def _vertices(geometry: Any) -> FloatArray:

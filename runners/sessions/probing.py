@@ -53,7 +53,7 @@ SLAB_LAYERS = 2
 _TURN = 0.7  # standard deviation: the turn of an object pushed, by its way in diameters
 
 
-def _pybullet_engine(
+def _pybullet_engine(  # noqa: PLR0917
     mesh: trimesh.Trimesh,
     configuration: Configuration,
     settings: ProbingSettings,
@@ -61,10 +61,10 @@ def _pybullet_engine(
 ) -> Engine:
     from runners.sessions.simulated import PyBulletEngine
 
-    return PyBulletEngine(mesh, configuration, settings, hand)
+    return PyBulletEngine(mesh, configuration, settings=settings, hand=hand)
 
 
-def _kinematic_engine(
+def _kinematic_engine(  # noqa: PLR0917
     mesh: trimesh.Trimesh,
     configuration: Configuration,
     settings: ProbingSettings,
@@ -73,7 +73,7 @@ def _kinematic_engine(
     from runners.sessions.kinematic import KinematicEngine
 
     laid = on_stand(laid_down(mesh, configuration), configuration)
-    return KinematicEngine(probed_mesh(mesh, settings.faults), laid, settings, hand)
+    return KinematicEngine(probed_mesh(mesh, settings.faults), laid, settings=settings, hand=hand)
 
 
 ENGINES: Mapping[str, Callable[..., Engine]] = {
@@ -84,7 +84,12 @@ ENGINES: Mapping[str, Callable[..., Engine]] = {
 
 
 def open_probing(
-    kind: str, mesh: trimesh.Trimesh, configuration_name: str, settings: ProbingSettings, seed: int
+    kind: str,
+    mesh: trimesh.Trimesh,
+    *,
+    configuration_name: str,
+    settings: ProbingSettings,
+    seed: int,
 ) -> ProbingSource:
     """Open a source of a kind of ENGINES; mesh in its own frame, metres.
 
@@ -96,10 +101,12 @@ def open_probing(
     else:
         configuration = find_configuration(configuration_name)
     engine = ENGINES[kind](mesh, configuration, settings, hand)
-    return ProbingSource(engine, mesh, configuration, settings, seed, hand)
+    return ProbingSource(
+        engine, mesh, configuration=configuration, settings=settings, seed=seed, hand=hand
+    )
 
 
-def _open_for_object(
+def _open_for_object(  # noqa: PLR0917
     kind: str, settings: ProbingSettings, object_model: ObjectModel | None, seed: int
 ) -> ProbingSource:
     """Open a source for an object. Raise SettingError if the configuration is another object's."""
@@ -113,14 +120,16 @@ def _open_for_object(
                 "its probes may miss this one; configuration=fitted is for any size"
             )
             warnings.warn(MeshWarning("other_size", text), stacklevel=2)
-    return open_probing(kind, object_model.mesh, configuration, settings, seed)
+    return open_probing(
+        kind, object_model.mesh, configuration_name=configuration, settings=settings, seed=seed
+    )
 
 
 PROBING: Mapping[str, SourceKind] = {
     kind: SourceKind(
         ProbingSettings,
         partial(_open_for_object, kind),
-        ObjectOrigin.PLACED,
+        object=ObjectOrigin.PLACED,
         keys={"configuration": "${configuration}"},  # of the top file, for short commands
         groups=({"faults": CLEAN},),
     )
@@ -136,6 +145,7 @@ class ProbingSource(Steerable):
         self,
         engine: Engine,
         mesh: trimesh.Trimesh,
+        *,
         configuration: Configuration,
         settings: ProbingSettings,
         seed: int,
@@ -170,11 +180,19 @@ class ProbingSource(Steerable):
         self._offered: Actions | None = None
         self._available = np.zeros(0, dtype=bool)
         self._engine = engine
-        self._gripper = SimulatedGripper(engine, settings, seed)
+        self._gripper = SimulatedGripper(engine, settings, seed=seed)
         self._faults: Faults | None = None
         if settings.faults != FaultSettings():
-            probed, pose = probed_mesh(mesh, settings.faults), engine.world_from_object
-            self._faults = Faults(settings.faults, probed, pose, self._voxels, self.workspace, seed)
+            probed = probed_mesh(mesh, settings.faults)
+            pose = engine.world_from_object
+            self._faults = Faults(
+                settings.faults,
+                probed,
+                world_from_object=pose,
+                free=self._voxels,
+                workspace=self.workspace,
+                seed=seed,
+            )
 
     @property
     def hand(self) -> HandShape:
@@ -194,16 +212,22 @@ class ProbingSource(Steerable):
         """Return the probes that can be chosen from; see `Steerable`."""
         push = self.settings.push_steps * self.settings.step_length
         if settings.choice == "around":
-            offered = around_actions(settings, self.workspace, self.hand)
+            offered = around_actions(settings, self.workspace, hand=self.hand)
         elif settings.choice == "forward":
             offered = forward_actions(
-                settings, self.workspace, self.hand, ROTATION, start=X_REST, length=push
+                settings,
+                self.workspace,
+                hand=self.hand,
+                rotation=ROTATION,
+                start=X_REST,
+                length=push,
             )
         else:
             starts = np.array([(X_REST, y, z) for y, z in self.configuration.grid])
             poses = world_from_gripper(starts)
-            offered = straight_actions(settings, poses, np.full(len(starts), push))
-        self._offered, self._available = offered, np.ones(len(offered), dtype=bool)
+            offered = straight_actions(settings, poses, length=np.full(len(starts), push))
+        self._offered = offered
+        self._available = np.ones(len(offered), dtype=bool)
         return offered
 
     def available(self) -> BoolArray:
@@ -226,14 +250,15 @@ class ProbingSource(Steerable):
     def _probe(self, step: int, rotation: FloatArray = ROTATION) -> Probe:
         """Return what the gripper has done since `forget`, turned by a rotation world_from_hand."""
         done = self._gripper
-        ends, contacts = np.array(done.ends), np.array(done.contacts).reshape(-1, 3)
+        ends = np.array(done.ends)
+        contacts = np.array(done.contacts).reshape(-1, 3)
         normals = np.array(done.normals).reshape(-1, 3)
         swept = np.array(done.path) if self.settings.sweep == "mini_steps" else ends
         interior = self._interior @ turned_from_forward(rotation).T
-        free = self._voxels.add(swept_voxels(self._voxels.lattice, interior, swept))
+        free = self._voxels.add(swept_voxels(self._voxels.lattice, interior, positions=swept))
         if self._faults is not None:
             free = np.concatenate([free, self._faults.wrongly_free(step, free)])
-            contacts, normals = self._faults.reported(step, contacts, normals)
+            contacts, normals = self._faults.reported(step, contacts, normals_out=normals)
         probe = Probe(
             step=step,
             outcome="contact" if len(contacts) else "free",
@@ -252,7 +277,8 @@ class ProbingSource(Steerable):
             return probe
         stream = StreamKey(self._seed, probe.step).stream(Purpose.PUSHES)
         angle = _TURN * self.settings.moves / self._diameter * float(normals(stream, 1)[0])
-        pose, turn = self._engine.world_from_object, axis_angle(np.eye(3)[2], angle)
+        pose = self._engine.world_from_object
+        turn = axis_angle(np.eye(3)[2], angle)
         pivot = apply(pose, self._centre[None])[0]
         moved = pivot + self.settings.moves * direction + turn @ (pose[:3, 3] - pivot)
         pose = self.world_from_object = compose(turn @ pose[:3, :3], moved)
@@ -295,7 +321,7 @@ def box_shell(lattice: Lattice, workspace: Workspace) -> FloatArray:
     return lattice.centres(np.argwhere(shell))
 
 
-def swept_voxels(lattice: Lattice, interior: FloatArray, positions: FloatArray) -> FloatArray:
+def swept_voxels(lattice: Lattice, interior: FloatArray, *, positions: FloatArray) -> FloatArray:
     """Return centres of the voxels that interior (M, 3) meets at one of positions (P, 3)."""
     bounds = np.array([positions.min(axis=0), positions.max(axis=0)])
     bounds += [interior.min(axis=0), interior.max(axis=0)]

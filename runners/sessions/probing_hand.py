@@ -144,7 +144,8 @@ def _depth(solid: trimesh.Trimesh, points: FloatArray) -> FloatArray:
     """
     lower, upper = np.asarray(solid.bounds)
     near = ((points >= lower - _FLUSH) & (points <= upper + _FLUSH)).all(axis=1)
-    chosen, depth = points[near], np.full(int(near.sum()), np.inf)
+    chosen = points[near]
+    depth = np.full(int(near.sum()), np.inf)
     for normal, corner in zip(solid.face_normals, solid.triangles[:, 0], strict=True):
         np.minimum(depth, (corner - chosen) @ normal, out=depth)
     every = np.full(len(points), -np.inf)

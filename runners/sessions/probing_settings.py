@@ -87,5 +87,5 @@ def without_defaults(session: Mapping[str, Any]) -> dict[str, Any]:
         for key, value in session.items()
         if key not in defaults
         or not isinstance(value, Mapping)
-        or build_settings(type(defaults[key]), value, f"session.{key}") != defaults[key]
+        or build_settings(type(defaults[key]), value, where=f"session.{key}") != defaults[key]
     }

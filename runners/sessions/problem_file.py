@@ -46,22 +46,24 @@ class ProbedProblems:
     """Problems of all points up to a step, wherever a registration starts."""
 
     def __init__(
-        self, events: Sequence[Event], of: ProbeSource | SessionStarted, sdf: SdfGrid, seed: int
+        self, events: Sequence[Event], of: ProbeSource | SessionStarted, *, sdf: SdfGrid, seed: int
     ) -> None:
         self._probes = [event for event in events if isinstance(event, Probe)]
-        self._of, self._sdf, self._seed = of, sdf, seed
+        self._of = of
+        self._sdf = sdf
+        self._seed = seed
         self.steps = tuple(probe.step for probe in self._probes)
 
     def problem(self, step: int) -> RegistrationProblem:
         """Return the problem of all that is known at a step."""
         new = [probe.new_points for probe in self._probes if probe.step <= step]
         return RegistrationProblem(
-            self._sdf,
-            KnownPoints.joined([self._of.initial_points, *new]),
-            np.eye(4)[None],
-            self._of.workspace,
-            self._of.free_resolution,
-            StreamKey(self._seed, step),
+            sdf=self._sdf,
+            points=KnownPoints.joined([self._of.initial_points, *new]),
+            initial_set=np.eye(4)[None],
+            workspace=self._of.workspace,
+            free_resolution=self._of.free_resolution,
+            key=StreamKey(self._seed, step),
         )
 
     def hypotheses(self, step: int) -> None:
@@ -72,7 +74,8 @@ class RecordedProblems:
     """The problems of a recording, with what was found."""
 
     def __init__(self, recording: Recording) -> None:
-        self.problem, self._recording = recording.problem, recording
+        self.problem = recording.problem
+        self._recording = recording
 
     def hypotheses(self, step: int) -> Hypotheses | None:
         """Return the result of a step, if one was recorded."""
@@ -82,6 +85,7 @@ class RecordedProblems:
 def open_problem_file(
     path: Path,
     object_config: Mapping[str, Any],
+    *,
     session: Mapping[str, Any],
     assets: Path,
     seed: int,
@@ -94,7 +98,8 @@ def open_problem_file(
     if is_recording(path):
         return _recorded(path)
     is_mcap = path.suffix.lower() == ".mcap"
-    kind, values = "points", {key: value for key, value in session.items() if key != "kind"}
+    kind = "points"
+    values = {key: value for key, value in session.items() if key != "kind"}
     of_sensors = session.get("kind") == "sensors"
     is_frame = of_sensors and path.suffix.lower() in FRAME_SUFFIXES
     if is_mcap or path.is_dir() or is_frame:
@@ -104,17 +109,25 @@ def open_problem_file(
                 "session/rig=NAME object=NAME"
             )
         # Images are for the eye; a pose beside the log is what is sought here.
-        kind, values = "sensors", {**values, "pose": "none", "images": False}
-    model = load_object(build_settings(ObjectConfig, object_config, "object"), assets)
+        kind = "sensors"
+        values = {**values, "pose": "none", "images": False}
+    model = load_object(build_settings(ObjectConfig, object_config, where="object"), assets)
     settings = session_settings(kind, {**values, "path": str(path)})
-    opened = open_source(kind, settings, model, seed)
-    events, sdf = list(opened.probes()), model.grid(settings)
-    problems = ProbedProblems(events, opened, sdf, seed)
+    opened = open_source(kind, settings, object_model=model, seed=seed)
+    events = list(opened.probes())
+    sdf = model.grid(settings)
+    problems = ProbedProblems(events, opened, sdf=sdf, seed=seed)
     described = [event.source for event in events if isinstance(event, RigDescribed)]
     digest = described[0] if described else file_digest(path)
     truth = opened.world_from_object
     return ProblemFile(
-        model.name, model.mesh, truth, model.epsilon, problems.steps, problems, digest
+        model.name,
+        model.mesh,
+        world_from_object=truth,
+        epsilon=model.epsilon,
+        steps=problems.steps,
+        problems=problems,
+        digest=digest,
     )
 
 
@@ -125,12 +138,20 @@ def _recorded(path: Path) -> ProblemFile:
     problems: ProbedProblems | RecordedProblems = RecordedProblems(recording)
     steps = recording.steps
     if not steps:  # nothing was registered, as where somebody else's method is to be measured
-        problems = ProbedProblems(recording.probes, start, start.sdf, start.seed)
+        problems = ProbedProblems(recording.probes, start, sdf=start.sdf, seed=start.seed)
         steps = problems.steps
     if not steps:
         raise RecordingError(f"recording {path} has no registration problem and no probe")
     truth = start.world_from_object
-    return ProblemFile(start.object, start.mesh, truth, epsilon, steps, problems, file_digest(path))
+    return ProblemFile(
+        start.object,
+        start.mesh,
+        world_from_object=truth,
+        epsilon=epsilon,
+        steps=steps,
+        problems=problems,
+        digest=file_digest(path),
+    )
 
 
 def is_recording(path: Path) -> bool:

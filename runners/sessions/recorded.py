@@ -67,7 +67,12 @@ class RecordedSource(Steerable):
         new = [probe.new_points for probe in self._probes]
         every = KnownPoints.joined([self.initial_points, *new])
         try:  # before any work; warnings are given when the points become known
-            check_points(every, start.sdf.diameter, self.free_resolution, self.workspace)
+            check_points(
+                every,
+                start.sdf.diameter,
+                free_resolution=self.free_resolution,
+                workspace=self.workspace,
+            )
         except PointsError as error:
             raise PointsError(f"recording {settings.path}: {error}") from None
 
@@ -94,7 +99,9 @@ class RecordedSource(Steerable):
                 f"cannot be chosen; accepted: a session of kind {' or '.join(PROBING)}, or of "
                 "sensors with solid parts of the hand in the rig"
             )
-        described = build_settings(DescribedHand, self._config.get("hand", {}), "session.hand")
+        described = build_settings(
+            DescribedHand, self._config.get("hand", {}), where="session.hand"
+        )
         return open_hand(described).shape
 
     def offer(self, settings: ActionSettings) -> Actions:
@@ -125,7 +132,7 @@ class RecordedSource(Steerable):
             depth = self._config.get("interior_depth", ProbingSettings.interior_depth)
         lattice = Lattice(self.workspace.lower, self.free_resolution)
         try:
-            return RecordedActions(self._probes, hand, lattice, depth=depth)
+            return RecordedActions(self._probes, hand, lattice=lattice, depth=depth)
         except (PoseError, SessionError) as error:
             raise SessionError(f"recording {self._recording.path}: {error}") from None
 
@@ -155,14 +162,14 @@ class RecordedSource(Steerable):
         """Release nothing, as nothing is held open."""
 
 
-def open_recorded(
+def open_recorded(  # noqa: PLR0917
     settings: RecordedSettings, object_model: ObjectModel | None, seed: int
 ) -> RecordedSource:
     """Open the source of a recording, whatever the seed. Raise RecordingError if it is none."""
     return RecordedSource(settings)
 
 
-RECORDED = SourceKind(RecordedSettings, open_recorded, ObjectOrigin.RECORDED)
+RECORDED = SourceKind(RecordedSettings, open_recorded, object=ObjectOrigin.RECORDED)
 
 
 def _start(settings: RecordedSettings, config: Mapping[str, Any]) -> Start:
@@ -192,7 +199,7 @@ class RecordedActions:
     """
 
     def __init__(
-        self, probes: Sequence[Probe], hand: HandShape, lattice: Lattice, *, depth: float
+        self, probes: Sequence[Probe], hand: HandShape, *, lattice: Lattice, depth: float
     ) -> None:
         """Make the actions of probes.
 
@@ -200,7 +207,8 @@ class RecordedActions:
 
         Raise SessionError for probes without a push along the hand's z axis.
         """
-        self._probes, self._lattice = list(probes), lattice
+        self._probes = list(probes)
+        self._lattice = lattice
         pushes = [_push(probe) for probe in self._probes]
         self._length = max((length for _, length in pushes), default=0.0)
         if self._length < _SHORTEST:
@@ -210,7 +218,9 @@ class RecordedActions:
             )
         self._starts = np.array([start for start, _ in pushes])  # (A, 4, 4)
         self.available: BoolArray = np.ones(len(self._probes), dtype=bool)
-        self._interior = _interior(hand, lattice.spacing / _NODES, depth)  # (M, 3), hand frame
+        self._interior = _interior(
+            hand, lattice.spacing / _NODES, depth=depth
+        )  # (M, 3), hand frame
         self._radius = float(np.sqrt((np.asarray(hand.vertices) ** 2).sum(axis=1)).max())
         free = [probe.new_points.free for probe in self._probes]
         self._free = np.concatenate(free)  # (N, 3), in the order of the recording
@@ -221,7 +231,7 @@ class RecordedActions:
     def offer(self, settings: ActionSettings) -> Actions:
         """Return an action for each probe, as long as the longest push; reach does not matter."""
         length = np.full(len(self._starts), self._length)
-        return straight_actions(replace(settings, reach=None), self._starts, length)
+        return straight_actions(replace(settings, reach=None), self._starts, length=length)
 
     def take(self, step: int, action: int) -> Probe:
         """Return the probe of an action, as the one of this step."""
@@ -232,7 +242,9 @@ class RecordedActions:
         chosen[earlier] = self._swept(self._voxels[earlier], probe.gripper_path)
         self._given |= chosen
         points = probe.new_points
-        new = KnownPoints(self._free[chosen], points.occupied, points.known, points.known_sdf)
+        new = KnownPoints(
+            self._free[chosen], points.occupied, known=points.known, known_sdf=points.known_sdf
+        )
         return replace(probe, step=step, new_points=new)
 
     def _swept(self, voxels: np.ndarray, path: FloatArray) -> BoolArray:
@@ -272,7 +284,7 @@ def _push(probe: Probe) -> tuple[FloatArray, float]:
     return path[start], max(-float(along[start]), 0.0)
 
 
-def _interior(hand: HandShape, spacing: float, depth: float) -> FloatArray:
+def _interior(hand: HandShape, spacing: float, *, depth: float) -> FloatArray:
     """Return points (M, 3) in the hand, deeper than `depth` in one of its bodies, in its frame."""
     import trimesh
 

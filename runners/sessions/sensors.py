@@ -69,7 +69,7 @@ class SensorsSettings(CheckedSettings):
             )
 
 
-def open_sensors(
+def open_sensors(  # noqa: PLR0917
     settings: SensorsSettings, object_model: ObjectModel | None, seed: int
 ) -> ProbeSource:
     """Open the source of a log, or of a depth image. Raise SessionError if it cannot be used."""
@@ -82,7 +82,7 @@ def open_sensors(
 SENSORS = SourceKind(
     SensorsSettings,
     open_sensors,
-    ObjectOrigin.REAL,
+    object=ObjectOrigin.REAL,
     groups=({"presets/rig@rig": "default"}, {"rig": "cabinet"}),
 )
 
@@ -115,7 +115,9 @@ class SensorsSource(ProbeSource):
         self._log = RawLog(path)
         self._find_pose(path, settings.pose)
         sensors = sensors_of(rig, hand)
-        self._first_pass = FirstPass(self._log, rig, sensors, hand, warnings=self._lines)
+        self._first_pass = FirstPass(
+            self._log, rig, sensors=sensors, hand=hand, warnings=self._lines
+        )
         free = FreeMap(self.workspace, self.free_resolution)
         cell = RobotCell(
             rig.world,
@@ -133,7 +135,7 @@ class SensorsSource(ProbeSource):
         self._solids = None
         if rig.hand is not None and hand is not None:
             joints = self._first_pass.joints
-            path_of_hand = HandPath(rig.hand, hand, joints, times=cell.tree.times, cell=cell)
+            path_of_hand = HandPath(rig.hand, hand, joints=joints, times=cell.tree.times, cell=cell)
             self._solids = hand.solids(joints.first())
             missing = [name for name in hand.joint_names if name not in joints.first()]
             if missing:
@@ -141,7 +143,7 @@ class SensorsSource(ProbeSource):
         self._second_pass = SecondPass(
             rig,
             sensors,
-            path_of_hand,
+            hand=path_of_hand,
             cell=cell,
             report=self.report,
             seed=seed,
@@ -159,7 +161,7 @@ class SensorsSource(ProbeSource):
     def probes(self) -> Iterator[ProbeEvent]:
         """Yield the probes of the log, in their order, once; measurements are read as they go."""
         first_pass = self._first_pass
-        yield RigDescribed(-1, self._rig.name, self._digest, self._solids)
+        yield RigDescribed(-1, self._rig.name, source=self._digest, hand=self._solids)
         messages: Iterator[Received] = iter(())
         if first_pass.measured():
             messages = self._log.messages(first_pass.measured())
@@ -179,7 +181,7 @@ class SensorsSource(ProbeSource):
                 )
         self.report.lines = self._lines.lines()
         last = first_pass.windows[-1].step
-        yield from (Logged(last, level, text) for level, text in self.report.lines)
+        yield from (Logged(last, level, text=text) for level, text in self.report.lines)
 
     def close(self) -> None:
         """Release nothing, as nothing is held open."""
@@ -235,18 +237,23 @@ class DepthFrameSource(ProbeSource):
         """Yield the image, and the probe that follows from it."""
         found, (camera,) = self._points, self._rig.cameras
         self.report.by_probe[0] = {camera.name: found.counts}
-        yield RigDescribed(-1, self._rig.name, file_digest(self._path))
+        yield RigDescribed(-1, self._rig.name, source=file_digest(self._path))
         if self._images:
             frame = self._frame
             measured = np.isfinite(frame.depth) & (frame.depth > 0.0)
-            view = View(frame.depth, measured, frame.camera, frame.world_from_camera)
-            yield recorded_image(0, camera.name, "depth", view, found.rays)
+            view = View(
+                frame.depth,
+                measured,
+                camera=frame.camera,
+                world_from_camera=frame.world_from_camera,
+            )
+            yield recorded_image(0, camera.name, kind="depth", view=view, mask=found.rays)
         count = len(found.points.known)
         text = f"{count} points on the object's surface, {len(found.points.free)} free voxels"
-        yield Logged(0, "info", text)
+        yield Logged(0, "info", text=text)
         self.report.lines = list(self._remarks(camera.name))
-        yield from (Logged(0, level, text) for level, text in self.report.lines)
-        yield Probe(0, "points", found.points)
+        yield from (Logged(0, level, text=text) for level, text in self.report.lines)
+        yield Probe(0, "points", new_points=found.points)
 
     def _remarks(self, name: str) -> Iterator[tuple[str, str]]:
         """Yield levels and texts on what was left out, and on what is suspicious."""
@@ -262,9 +269,11 @@ class DepthFrameSource(ProbeSource):
             if away > _FAR:
                 text = f"{key} is {away:.4g} m from the origin; check its unit, which is metres"
                 yield "warning", text
-        view = View(frame.depth, found.rays, frame.camera, frame.world_from_camera)
-        origin, ends = some_rays(self._rig.cameras[0], view, found.rays)
-        if found.rays.any() and not is_entered(self.workspace, origin, ends):
+        view = View(
+            frame.depth, found.rays, camera=frame.camera, world_from_camera=frame.world_from_camera
+        )
+        origin, ends = some_rays(self._rig.cameras[0], view, usable=found.rays)
+        if found.rays.any() and not is_entered(self.workspace, origin, ends=ends):
             yield "warning", f"{name}: {MISSED}"
         for sensor, counts in ((name, found.counts), ("label", label)):
             if counts is not None and (left_out := counts.left_out()):

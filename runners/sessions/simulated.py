@@ -43,6 +43,7 @@ class PyBulletEngine:
         self,
         mesh: trimesh.Trimesh,
         configuration: Configuration,
+        *,
         settings: ProbingSettings,
         hand: ProbingHand,
     ) -> None:
@@ -61,13 +62,17 @@ class PyBulletEngine:
         try:
             _set_up(self._world)
             with tempfile.TemporaryDirectory() as folder:
-                settled = _settle(self._world, mesh, laid_down(mesh, configuration))
+                settled = _settle(self._world, mesh, laid=laid_down(mesh, configuration))
                 self.world_from_object = on_stand(settled, configuration)
                 probed = probed_mesh(mesh, settings.faults)
-                file = _collision_file(self._world, probed, Path(folder), settings.collision_mesh)
+                file = _collision_file(
+                    self._world, probed, folder=Path(folder), kind=settings.collision_mesh
+                )
                 concave = settings.collision_mesh == "visual"
-                self._object = _fixed_object(self._world, file, self.world_from_object, concave)
-                self._hand = _hand(self._world, hand, Path(folder))
+                self._object = _fixed_object(
+                    self._world, file, world_from_object=self.world_from_object, concave=concave
+                )
+                self._hand = _hand(self._world, hand, folder=Path(folder))
         except BaseException:
             self.close()
             raise
@@ -94,11 +99,12 @@ class PyBulletEngine:
             return Touch(position, force)
         # As the hand presses on, the engine's contact wanders over the faces that touch by some
         # millimetres; where the touch began is known best.
-        return Touch(position, force, self._began.contact, self._began.normal)
+        return Touch(position, force, contact=self._began.contact, normal=self._began.normal)
 
     def place(self, pose: FloatArray) -> bool:
         """Put the hand at a pose (4, 4); False, and not to be used, if the object is there."""
-        world, position = self._world, pose[:3, 3].tolist()
+        world = self._world
+        position = pose[:3, 3].tolist()
         quaternion = Rotation.from_matrix(turned_from_forward(pose[:3, :3])).as_quat().tolist()
         world.resetBasePositionAndOrientation(self._hand, position, quaternion)
         world.changeConstraint(self._holder, position, quaternion, maxForce=self._max_force)
@@ -128,7 +134,7 @@ class PyBulletEngine:
         total = np.sum(forces, axis=0)
         hardest = max(records, key=lambda record: record[_FORCE])
         contact, normal = np.array(hardest[_POINT_ON_B]), np.array(hardest[_NORMAL_ON_B])
-        return _Reading(contact, normal, float(np.sqrt(total @ total)))
+        return _Reading(contact, normal, force=float(np.sqrt(total @ total)))
 
 
 class _Reading(NamedTuple):
@@ -138,7 +144,10 @@ class _Reading(NamedTuple):
 
 
 # Where a contact record of PyBullet has what; B is the object.
-_POINT_ON_B, _NORMAL_ON_B, _DISTANCE, _FORCE = 6, 7, 8, 9
+_POINT_ON_B = 6
+_NORMAL_ON_B = 7
+_DISTANCE = 8
+_FORCE = 9
 
 
 def _set_up(world: Any) -> None:
@@ -151,7 +160,7 @@ def _set_up(world: Any) -> None:
     )
 
 
-def _settle(world: Any, mesh: trimesh.Trimesh, laid: FloatArray) -> FloatArray:
+def _settle(world: Any, mesh: trimesh.Trimesh, *, laid: FloatArray) -> FloatArray:
     """Return the pose (4, 4) at which the mesh has settled under gravity from pose `laid`.
 
     On a plane only the convex hull can touch; mass and inertia are those of the mesh itself.
@@ -182,7 +191,7 @@ def _settle(world: Any, mesh: trimesh.Trimesh, laid: FloatArray) -> FloatArray:
     return settled
 
 
-def _collision_file(world: Any, mesh: trimesh.Trimesh, folder: Path, kind: str) -> Path:
+def _collision_file(world: Any, mesh: trimesh.Trimesh, *, folder: Path, kind: str) -> Path:
     """Return a file with the mesh, or with its convex parts."""
     whole, parts = folder / "object.obj", folder / "parts.obj"
     _write_obj(whole, [mesh])
@@ -193,7 +202,7 @@ def _collision_file(world: Any, mesh: trimesh.Trimesh, folder: Path, kind: str) 
     return parts
 
 
-def _fixed_object(world: Any, file: Path, world_from_object: FloatArray, concave: bool) -> int:
+def _fixed_object(world: Any, file: Path, *, world_from_object: FloatArray, concave: bool) -> int:
     flags = world.GEOM_FORCE_CONCAVE_TRIMESH if concave else 0
     shape = world.createCollisionShape(world.GEOM_MESH, fileName=str(file), flags=flags)
     body: int = world.createMultiBody(0, shape, **_placed(world_from_object))
@@ -201,7 +210,7 @@ def _fixed_object(world: Any, file: Path, world_from_object: FloatArray, concave
     return body
 
 
-def _hand(world: Any, hand: ProbingHand, folder: Path) -> int:
+def _hand(world: Any, hand: ProbingHand, *, folder: Path) -> int:
     """Return the hand, put at its start; without inertia the engine keeps its orientation."""
     _write_obj(folder / "hand.obj", list(hand.solids))
     shape = world.createCollisionShape(world.GEOM_MESH, fileName=str(folder / "hand.obj"))

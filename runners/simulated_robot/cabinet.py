@@ -24,10 +24,11 @@ from runners.sessions.placement import laid_down
 from runners.sessions.probing_hand import ROTATION
 
 
-def _box(x: Sequence[float], y: Sequence[float], z: Sequence[float]) -> BoxRig:
+def _box(x: Sequence[float], y: Sequence[float], z: Sequence[float]) -> BoxRig:  # noqa: PLR0917
     """Return a box by its bounds along the world's axes."""
     lower, upper = np.array([x, y, z]).T
-    (sx, sy, sz), (px, py, pz) = (upper - lower).tolist(), ((upper + lower) / 2.0).tolist()
+    (sx, sy, sz) = (upper - lower).tolist()
+    (px, py, pz) = ((upper + lower) / 2.0).tolist()
     return BoxRig((sx, sy, sz), (px, py, pz))
 
 
@@ -59,7 +60,13 @@ _ALL = (
 )
 CABINET_CONFIGURATIONS = {
     name: Configuration(
-        name, name.split("_")[1], y, z, (*place, SHELF), (0.0, 0.0, yaw), CABINET_WORKSPACE
+        name,
+        name.split("_")[1],
+        y=y,
+        z=z,
+        position=(*place, SHELF),
+        rotation=(0.0, 0.0, yaw),
+        workspace=CABINET_WORKSPACE,
     )
     for name, y, z, place, yaw in _ALL
 }
@@ -135,7 +142,7 @@ def rigid_parts() -> tuple[BoxRig, ...]:
         BoxRig(size=(0.08, 0.08, 0.30), position=(0.0, 0.0, -0.22)),
         BoxRig(size=(0.09, 0.09, 0.10), position=(0.0, 0.0, -0.03)),
         BoxRig(size=(0.086, 0.15, 0.05), position=(0.0, 0.0, 0.045)),
-        *(BoxRig(_HOUSING, (0.0, s * y, z), (-s * TILT, 0.0, 0.0)) for s in PADS.values()),
+        *(BoxRig(_HOUSING, (0.0, s * y, z), rotation=(-s * TILT, 0.0, 0.0)) for s in PADS.values()),
     )
 
 

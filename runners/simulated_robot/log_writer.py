@@ -32,7 +32,7 @@ class LogWriter:
         self._messages = 0
 
     def add(
-        self, topic: str, kind: str, message: Mapping[str, Any], stamp: int, log_time: int
+        self, topic: str, kind: str, *, message: Mapping[str, Any], stamp: int, log_time: int
     ) -> None:
         """Add a message of a type of DEFINITIONS, sent at `stamp` and received at `log_time`."""
         self._messages += 1
@@ -65,7 +65,9 @@ def header(frame: str, stamp: int) -> dict[str, Any]:
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
 
 
-def transform(parent: str, child: str, parent_from_child: FloatArray, stamp: int) -> dict[str, Any]:
+def transform(
+    parent: str, child: str, *, parent_from_child: FloatArray, stamp: int
+) -> dict[str, Any]:
     """Return a geometry_msgs/TransformStamped of a pose (4, 4)."""
     quaternion = Rotation.from_matrix(parent_from_child[:3, :3]).as_quat()
     return {
@@ -78,7 +80,7 @@ def transform(parent: str, child: str, parent_from_child: FloatArray, stamp: int
     }
 
 
-def image(frame: str, values: np.ndarray, stamp: int) -> dict[str, Any]:
+def image(frame: str, values: np.ndarray, *, stamp: int) -> dict[str, Any]:
     """Return a sensor_msgs/Image of depths (H, W): uint16 or float32."""
     height, width = values.shape
     return {
@@ -92,7 +94,7 @@ def image(frame: str, values: np.ndarray, stamp: int) -> dict[str, Any]:
     }
 
 
-def camera_info(frame: str, camera: PinholeCamera, stamp: int) -> dict[str, Any]:
+def camera_info(frame: str, camera: PinholeCamera, *, stamp: int) -> dict[str, Any]:
     """Return a sensor_msgs/CameraInfo of a camera without distortion."""
     cx, cy, fx, fy = camera.cx, camera.cy, camera.fx, camera.fy
     return {
@@ -107,6 +109,6 @@ def camera_info(frame: str, camera: PinholeCamera, stamp: int) -> dict[str, Any]
     }
 
 
-def joint_state(names: Sequence[str], positions: Sequence[float], stamp: int) -> dict[str, Any]:
+def joint_state(names: Sequence[str], positions: Sequence[float], *, stamp: int) -> dict[str, Any]:
     """Return a sensor_msgs/JointState."""
     return {"header": header("", stamp), "name": names, "position": positions}

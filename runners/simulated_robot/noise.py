@@ -27,7 +27,7 @@ BUBBLE_STEP = 0.0001  # m: to which a bubble's camera rounds
 BUBBLE_LOST = 0.001
 
 
-def stereo_depth(
+def stereo_depth(  # noqa: PLR0917
     depth: FloatArray, camera: PinholeCamera, stream: np.random.Generator
 ) -> np.ndarray:
     """Return what the outer camera measures of depths (H, W), metres: uint16 mm, 0 for none.
@@ -38,7 +38,7 @@ def stereo_depth(
     """
     scale = camera.width / _WIDTH
     shadow = _shadow(depth, camera.fx * BASELINE)
-    measured = _strayed(depth, PATCH * scale, STRAY * scale, stream)
+    measured = _strayed(depth, PATCH * scale, stray=STRAY * scale, stream=stream)
     low, high = ndimage.minimum_filter(depth, 3), ndimage.maximum_filter(depth, 3)
     low, high = np.minimum(low, measured), np.maximum(high, measured)
     edge = high - low > EDGE
@@ -60,7 +60,7 @@ def bubble_depth(depth: FloatArray, stream: np.random.Generator) -> np.ndarray:
 
 
 def _strayed(
-    depth: FloatArray, patch: float, stray: float, stream: np.random.Generator
+    depth: FloatArray, patch: float, *, stray: float, stream: np.random.Generator
 ) -> FloatArray:
     """Return depths (H, W), each taken from some pixels beside; near pixels stray alike."""
     height, width = depth.shape

@@ -91,13 +91,16 @@ class Pads:
         self,
         scene: PhysicsScene,
         camera: RenderedCamera,
+        *,
         mesh: trimesh.Trimesh,
         world_from_object: FloatArray,
     ) -> None:
         """Make the pads against a mesh in its frame, metres."""
         fine, _ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _SPACING, max_iter=20)
         self._surface = apply(world_from_object, np.unique(fine, axis=0))
-        self._scene, self._camera, self._membrane = scene, camera, Membrane(camera)
+        self._scene = scene
+        self._camera = camera
+        self._membrane = Membrane(camera)
 
     def depths(self, world_from_wrist: FloatArray) -> dict[str, FloatArray]:
         """Return depth (H, W) in metres of each pad's membrane, pressed or not."""
@@ -112,7 +115,8 @@ class Pads:
 
     def touches(self, depths: dict[str, FloatArray]) -> bool:
         """Return whether so many pixels of a pad are dented, as filtered, that the robot stops."""
-        contact, rest = ContactRig(), self._membrane.rest
+        contact = ContactRig()
+        rest = self._membrane.rest
         dents = [ndimage.uniform_filter(rest - depth, contact.filter) for depth in depths.values()]
         return any((dent > contact.threshold).sum() >= contact.pixels for dent in dents)
 

@@ -39,15 +39,16 @@ class PhysicsScene:
                 flags=self._world.GEOM_FORCE_CONCAVE_TRIMESH,  # no two of these touch each other
             )
             self._fixed = [
-                self._body(solid, look["object"], world_from_object),
-                self._body(self._boxes(cabinet.CABINET), look["cabinet"], np.eye(4)),
+                self._body(solid, look["object"], pose=world_from_object),
+                self._body(self._boxes(cabinet.CABINET), look["cabinet"], pose=np.eye(4)),
             ]
-            self._hand = self._body(self._boxes(cabinet.rigid_parts()), look["hand"], _AWAY)
+            self._hand = self._body(self._boxes(cabinet.rigid_parts()), look["hand"], pose=_AWAY)
 
     def depth(
         self,
         camera: RenderedCamera,
         world_from_camera: FloatArray,
+        *,
         world_from_wrist: FloatArray = _AWAY,
     ) -> FloatArray:
         """Return depth (H, W) along z, metres, camera.far for nothing; without a wrist, no hand.
@@ -100,7 +101,7 @@ class PhysicsScene:
             )
         )
 
-    def _body(self, solid: int, look: int, pose: FloatArray) -> int:
+    def _body(self, solid: int, look: int, *, pose: FloatArray) -> int:
         body: int = self._world.createMultiBody(0, solid, look)
         self._world.changeDynamics(body, -1, collisionMargin=0.0)
         self._place(body, pose)
@@ -113,7 +114,10 @@ class PhysicsScene:
 
 def _projection(camera: RenderedCamera) -> FloatArray:
     """Return the engine's projection matrix, through the lower left corner of every pixel."""
-    cx, cy, near, far = camera.cx, camera.cy, camera.near, camera.far
+    cx = camera.cx
+    cy = camera.cy
+    near = camera.near
+    far = camera.far
     projection = np.zeros((4, 4))
     projection[0, 0] = 2.0 * camera.fx / camera.width
     projection[0, 2] = 1.0 - 2.0 * cx / camera.width

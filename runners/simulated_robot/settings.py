@@ -13,7 +13,7 @@ from runners.simulated_robot.cabinet import CAP, CAP_BASE
 
 VIEW = 80.0  # degrees: of the outer camera, horizontal
 
-Width = Annotated[int, number_between(16, 4096, " pixels")]
+Width = Annotated[int, number_between(16, 4096, unit=" pixels")]
 Rate = Annotated[float, positive, at_most(50.0)]  # Hz: of the simulated clock at most
 Duration = Annotated[float, not_negative, at_most(60.0)]
 
@@ -36,7 +36,7 @@ class CameraSettings(CheckedSettings):
     @property
     def pinhole(self) -> RenderedCamera:
         focal = self.width / 2.0 / tan(VIEW * pi / 360.0)
-        return _centred(self.width, self.width * 3 // 4, focal, near=0.05, far=6.0)
+        return _centred(self.width, self.width * 3 // 4, focal=focal, near=0.05, far=6.0)
 
 
 @dataclass(frozen=True)
@@ -49,13 +49,13 @@ class BubbleSettings(CheckedSettings):
     @property
     def pinhole(self) -> RenderedCamera:
         focal = self.width / 2.0 / (CAP[0] / CAP_BASE)
-        return _centred(self.width, self.width * 171 // 224, focal, near=0.02, far=0.5)
+        return _centred(self.width, self.width * 171 // 224, focal=focal, near=0.02, far=0.5)
 
 
-def _centred(width: int, height: int, focal: float, near: float, far: float) -> RenderedCamera:
+def _centred(width: int, height: int, *, focal: float, near: float, far: float) -> RenderedCamera:
     """Return a camera that looks through the middle of its image."""
     cx, cy = (width - 1) / 2.0, (height - 1) / 2.0
-    return RenderedCamera(width, height, focal, focal, cx, cy, near, far)
+    return RenderedCamera(width, height, fx=focal, fy=focal, cx=cx, cy=cy, near=near, far=far)
 
 
 @dataclass(frozen=True)

@@ -79,6 +79,7 @@ class SimulatedLog:
 def simulate_log(
     path: Path,
     configuration: Configuration,
+    *,
     mesh: trimesh.Trimesh,
     seed: int,
     settings: RobotSettings,
@@ -99,8 +100,8 @@ def simulate_log(
         whole_file(path, "a file in a folder that can be written") as beside,
         LogWriter(beside) as log,
     ):
-        pads = Pads(scene, settings.bubbles.pinhole, mesh, world_from_object)
-        robot = _Robot(log, scene, pads, settings, seed)
+        pads = Pads(scene, settings.bubbles.pinhole, mesh=mesh, world_from_object=world_from_object)
+        robot = _Robot(log, scene, pads=pads, settings=settings, seed=seed)
         robot.stand(settings.standing)
         for step, offset in enumerate(configuration.grid[: settings.probes]):
             pushes.append(robot.probe(step, offset))
@@ -114,9 +115,11 @@ class _Robot:
     """Moves the wrist on straight lines, and sends at every tick of its clock what is due."""
 
     def __init__(
-        self, log: LogWriter, scene: PhysicsScene, pads: Pads, settings: RobotSettings, seed: int
+        self, log: LogWriter, scene: PhysicsScene, *, pads: Pads, settings: RobotSettings, seed: int
     ) -> None:
-        self._log, self._scene, self._pads = log, scene, pads
+        self._log = log
+        self._scene = scene
+        self._pads = pads
         self._settings, self._seed = settings, seed
         self._ticks = 0
         self._place(np.array(HOME))
@@ -128,7 +131,7 @@ class _Robot:
             log_writer.transform(parent, child, parent_from_child=pose, stamp=self._now)
             for parent, child, pose in fixed
         ]
-        self._send("/tf_static", "tf2_msgs/TFMessage", {"transforms": sent})
+        self._send("/tf_static", "tf2_msgs/TFMessage", message={"transforms": sent})
 
     def stand(self, seconds: float) -> None:
         """Wait, with all sensors on."""
@@ -137,7 +140,7 @@ class _Robot:
 
     def move(self, target: FloatArray) -> None:
         """Go to target (3,), whatever is in the way."""
-        for position in _line(self._position, target, MOVE_SPEED):
+        for position in _line(self._position, target, speed=MOVE_SPEED):
             self._arrive(position)
 
     def probe(self, step: int, offset: tuple[float, float]) -> Push:
@@ -147,19 +150,19 @@ class _Robot:
         start = np.array(REST)
         start[1:] += np.array(offset) + SPREAD * np.clip(drawn, -3, 3)
         self.move(start)
-        self._send("/probe", "std_msgs/String", {"data": f"begin {step}"})
+        self._send("/probe", "std_msgs/String", message={"data": f"begin {step}"})
         stopped = self._push()
         self.stand(self._settings.dwell)
-        self._send("/probe", "std_msgs/String", {"data": f"end {step}"})
+        self._send("/probe", "std_msgs/String", message={"data": f"end {step}"})
         reach = float(self._position[0] - start[0])
         self.move(start)
-        return Push(step, float(start[1]), float(start[2]), reach, stopped)
+        return Push(step, float(start[1]), z=float(start[2]), reach=reach, stopped=stopped)
 
     def _push(self) -> str:
         """Step forward until the hand is stopped; by what."""
         ahead = np.array([PUSH_STEP, 0.0, 0.0])
         for _ in range(self._settings.push_steps):
-            way = _line(self._position, self._position + ahead, PUSH_SPEED)
+            way = _line(self._position, self._position + ahead, speed=PUSH_SPEED)
             for position in way:
                 self._arrive(position)
                 if self._scene.clearance(self._pose) <= 0.0:
@@ -185,7 +188,8 @@ class _Robot:
 
     def _place(self, position: FloatArray) -> None:
         """Put the wrist at position (3,), where the bubbles' cameras see depths without noise."""
-        self._position, self._pose = position, world_from_wrist(position)
+        self._position = position
+        self._pose = world_from_wrist(position)
         self._depths = self._pads.depths(self._pose)
 
     def _arrive(self, position: FloatArray) -> None:
@@ -193,19 +197,23 @@ class _Robot:
         if not np.array_equal(position, self._position):
             self._place(position)
         now = self._now
-        moved = log_writer.transform(WORLD, WRIST, self._pose, now)
-        self._send("/tf", "tf2_msgs/TFMessage", {"transforms": [moved]})
-        joints = log_writer.joint_state(JOINTS, position.tolist(), now)
-        self._send("/joint_states", "sensor_msgs/JointState", joints)
+        moved = log_writer.transform(WORLD, WRIST, parent_from_child=self._pose, stamp=now)
+        self._send("/tf", "tf2_msgs/TFMessage", message={"transforms": [moved]})
+        joints = log_writer.joint_state(JOINTS, position.tolist(), stamp=now)
+        self._send("/joint_states", "sensor_msgs/JointState", message=joints)
         bubbles, camera = self._settings.bubbles, self._settings.camera
         if self._due(bubbles.rate):
             for pad, depth in self._depths.items():
                 topic, frame = f"/bubble_{pad}/depth", f"bubble_{pad}_camera"
-                self._send_image(topic, frame, bubbles.pinhole, partial(bubble_depth, depth))
+                self._send_image(
+                    topic, frame, camera=bubbles.pinhole, measure=partial(bubble_depth, depth)
+                )
         if self._due(camera.rate):
-            depth = self._scene.depth(camera.pinhole, self._world_from_camera, self._pose)
+            depth = self._scene.depth(
+                camera.pinhole, self._world_from_camera, world_from_wrist=self._pose
+            )
             measure = partial(stereo_depth, depth, camera.pinhole)
-            self._send_image("/camera/depth", CAMERA, camera.pinhole, measure)
+            self._send_image("/camera/depth", CAMERA, camera=camera.pinhole, measure=measure)
         self._ticks += 1
         self._log.flush(now)
 
@@ -217,6 +225,7 @@ class _Robot:
         self,
         topic: str,
         frame: str,
+        *,
         camera: PinholeCamera,
         measure: Callable[[np.random.Generator], np.ndarray],
     ) -> None:
@@ -224,24 +233,31 @@ class _Robot:
         self._images += 1
         stream = self._key.stream(Purpose.SENSOR_NOISE, self._images)
         if stream.random() >= self._settings.drop:
-            sent = log_writer.image(frame, measure(stream), self._now)
-            info = log_writer.camera_info(frame, camera, self._now)
-            self._send(f"{topic}/image_raw", "sensor_msgs/Image", sent, _SLOW)
-            self._send(f"{topic}/camera_info", "sensor_msgs/CameraInfo", info)
+            sent = log_writer.image(frame, measure(stream), stamp=self._now)
+            info = log_writer.camera_info(frame, camera, stamp=self._now)
+            self._send(f"{topic}/image_raw", "sensor_msgs/Image", message=sent, latency=_SLOW)
+            self._send(f"{topic}/camera_info", "sensor_msgs/CameraInfo", message=info)
 
     def _send(
         self,
         topic: str,
         kind: str,
+        *,
         message: Mapping[str, Any],
         latency: tuple[float, float] = _QUICK,
     ) -> None:
         least, more = latency
         taken = least + 2.0 * more * self._latency.random()
-        self._log.add(topic, kind, message, self._now, self._now + round(taken * _SECOND))
+        self._log.add(
+            topic,
+            kind,
+            message=message,
+            stamp=self._now,
+            log_time=self._now + round(taken * _SECOND),
+        )
 
 
-def _line(start: FloatArray, end: FloatArray, speed: float) -> Iterator[FloatArray]:
+def _line(start: FloatArray, end: FloatArray, *, speed: float) -> Iterator[FloatArray]:
     """Yield the positions (3,) of the wrist at the ticks of its way; the last is its end."""
     way = end - start
     ticks = int(np.ceil(np.sqrt(way @ way) / (speed * _SECONDS) - 1e-9))

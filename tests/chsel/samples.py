@@ -25,13 +25,15 @@ def kernel_files():
     return sorted(file for file in files if "from chsel.numerics.compiler" in file.read_text())
 
 
-def ball_grid(radius, resolution, half):
+def ball_grid(radius, resolution, *, half):
     """The exact distance to a ball around the origin, `half` nodes to every side of it."""
     nodes = np.moveaxis(np.indices((2 * half + 1,) * 3), 0, -1) * resolution - half * resolution
     distance = np.sqrt((nodes**2).sum(axis=-1))
     safe = np.where(distance > 0.0, distance, 1.0)[..., None]
     gradient = np.where(distance[..., None] > 0.0, nodes / safe, [1.0, 0.0, 0.0])
-    return SdfGrid(np.full(3, -half * resolution), resolution, distance - radius, gradient)
+    return SdfGrid(
+        np.full(3, -half * resolution), resolution, values=distance - radius, gradients=gradient
+    )
 
 
 def bracket():
@@ -62,7 +64,7 @@ def box_distance(points, sides):
     return outside + np.minimum(beyond.max(axis=-1), 0.0)
 
 
-def plain_energy(noise, residuals, depths):
+def plain_energy(noise, residuals, *, depths):
     """E of one pose as chsel.problem.noise has it, of residuals (N,) and depths (M,), metres."""
 
     def density(size, sigma):
@@ -86,7 +88,7 @@ def plain_energy(noise, residuals, depths):
     return -most - math.log(sum(math.exp(one - most) for one in logs)) + power * wrong
 
 
-def plain_energies(noise, sdf, points, poses):
+def plain_energies(noise, sdf, *, points, poses):
     """The same (B,) of poses, by distances between the nodes of a grid."""
     energies = []
     for pose in poses.matrices:
@@ -96,11 +98,11 @@ def plain_energies(noise, sdf, points, poses):
         )
         depths = np.concatenate([-free, occupied])
         wrong = depths[depths > 0.0]  # others cost nothing
-        energies.append(plain_energy(noise, known - points.sdf, wrong))
+        energies.append(plain_energy(noise, known - points.sdf, depths=wrong))
     return np.array(energies)
 
 
-def random_poses(stream, count, reach):
+def random_poses(stream, count, *, reach):
     """Transforms (count, 4, 4) of any rotation, translated by at most `reach` along each axis."""
     rotations = random_rotations(stream, count)
     return compose(rotations, stream.uniform(-reach, reach, (count, 3)))
@@ -146,7 +148,8 @@ def decode(space, vectors):
     """Rotations (B, 3, 3) and translations (B, 3) of vectors (B, d), differentiable."""
     if not isinstance(space, SE2Space):
         return _gram_schmidt(vectors[:, :6]), vectors[:, 6:9]
-    turn, rest = torch.tensor(hat(space.axis)), torch.tensor(space.resting_rotation)
+    turn = torch.tensor(hat(space.axis))
+    rest = torch.tensor(space.resting_rotation)
     e_u, e_v, axis = (torch.tensor(part).double() for part in (space.e_u, space.e_v, space.axis))
     identity = torch.eye(3, dtype=torch.float64)
     sine, cosine = (f(vectors[:, 0])[:, None, None] for f in (torch.sin, torch.cos))

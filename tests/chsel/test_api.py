@@ -195,7 +195,8 @@ HAND = chsel.HandShape.of(BOX)
 ACTIONS = chsel.Actions(np.eye(4)[None], np.ones(1))
 POLICY = chsel.build_policy("information")
 ONLINE = build_method("icp").online
-GRID, ROOM = chsel.SdfGrid.from_mesh(BOX, 0.02), chsel.Workspace((0, 0, 0), (1, 1, 1))
+GRID = chsel.SdfGrid.from_mesh(BOX, 0.02)
+ROOM = chsel.Workspace((0, 0, 0), (1, 1, 1))
 KNOWN = chsel.KnownPoints(known=SURFACE)
 SDF = r"sdf is .*; accepted: .*chsel\.SdfGrid\.from_mesh"
 

@@ -20,20 +20,36 @@ L_SHAPE = trimesh.boolean.union(
     [BOX, trimesh.creation.box(bounds=[[0.04, -0.03, 0.0], [0.10, 0.03, 0.12]])], engine="manifold"
 )
 GRID, L_GRID = SdfGrid.from_mesh(BOX, 0.004), SdfGrid.from_mesh(L_SHAPE, 0.004)
-Z, STILL = np.array([0.0, 0.0, 1.0]), np.eye(4)
+Z = np.array([0.0, 0.0, 1.0])
+STILL = np.eye(4)
 HALF_TURN = compose(axis_angle(Z, np.array(math.pi)), np.zeros(3))
 
 
-def result(world_from_object, bests=(0,), verdict="several modes"):
+def result(world_from_object, bests=(0,), *, verdict="several modes"):
     """Hypotheses at poses (K, 4, 4), the first of each mode at `bests`."""
     count = len(world_from_object)
-    none = np.zeros(count, dtype=bool), np.full(count, -1), np.zeros((0, 4, 4))
     modes = len(bests) if verdict != "wide" else 0
-    trust = Trust(0.001, 0.0, 0.5, modes, 0.01, verdict, 6, tuple(bests))
-    return Hypotheses(inverse(world_from_object), np.arange(count) * 1.0, *none, trust=trust)
+    trust = Trust(
+        noise=0.001,
+        outliers=0.0,
+        misfit=0.5,
+        modes=modes,
+        spread=0.01,
+        verdict=verdict,
+        redundancy=6,
+        best_of_modes=tuple(bests),
+    )
+    return Hypotheses(
+        inverse(world_from_object),
+        np.arange(count) * 1.0,
+        duplicate=np.zeros(count, dtype=bool),
+        cell=np.full(count, -1),
+        elites=np.zeros((0, 4, 4)),
+        trust=trust,
+    )
 
 
-def shifted(vectors, turns=None, about=STILL):
+def shifted(vectors, turns=None, *, about=STILL):
     """Poses (K, 4, 4): `about`, turned by rotation vectors (K, 3) and shifted, in the world."""
     turns = np.zeros_like(vectors) if turns is None else turns
     rotations = rotation_vector(turns)
@@ -46,7 +62,7 @@ def test_modes_have_weights_covariances_and_numbers_that_stay():
     steps = random.multivariate_normal(np.zeros(6), np.diag([1, 4, 9, 1, 2, 3]) * 1e-6, 8000)
     steps[0] = 0.0
     here = compose(axis_angle(Z, np.array(0.4)), np.array([0.3, -0.1, 0.2]))
-    first = shifted(steps[:, :3], steps[:, 3:], here)[:30]
+    first = shifted(steps[:, :3], steps[:, 3:], about=here)[:30]
     second = (here @ HALF_TURN) @ np.eye(4)
     poses = np.concatenate([first, np.repeat(second[None], 10, axis=0)])
     belief = PoseBelief(L_GRID, result(poses, (0, 30)))
@@ -72,12 +88,13 @@ def test_modes_have_weights_covariances_and_numbers_that_stay():
 
 @pytest.mark.parametrize("mesh", [BOX, trimesh.creation.cylinder(0.03, 0.1)])
 def test_members_that_look_alike_have_no_covariance(mesh):
-    symmetry, sdf = object_symmetry(mesh), SdfGrid.from_mesh(mesh, 0.004)
+    symmetry = object_symmetry(mesh)
+    sdf = SdfGrid.from_mesh(mesh, 0.004)
     poses = np.stack([np.eye(4), HALF_TURN, compose(axis_angle(Z, np.array(math.pi)), np.zeros(3))])
     if symmetry.axis is not None:
         angles = np.linspace(0.0, 6.0, 5)
         poses = compose(axis_angle(np.repeat(Z[None], 5, axis=0), angles), np.zeros((5, 3)))
-    (mode,) = PoseBelief(sdf, result(poses, verdict="determined"), symmetry).modes
+    (mode,) = PoseBelief(sdf, result(poses, verdict="determined"), symmetry=symmetry).modes
     assert np.abs(mode.covariance).max() < 1e-8
 
 
@@ -96,7 +113,7 @@ def test_chances_are_shares_of_the_members():
     assert (np.abs(drawn.sum(axis=0) - 200) < 60).all()
 
 
-def works(grip, width, boxes, gripper):
+def works(grip, width, *, boxes, gripper):
     """Whether a grasp from above along the box's short side works, by intervals alone."""
     x, y, z = grip
     found = []
@@ -110,19 +127,24 @@ def works(grip, width, boxes, gripper):
 
 
 def test_grasps_of_boxes_are_right_by_intervals():
-    gripper, boxes = Gripper(), (0.0, 0.1, 0.3)
+    gripper = Gripper()
+    boxes = (0.0, 0.1, 0.3)
     belief = PoseBelief(GRID, result(shifted(np.array([[box, 0.0, 0.0] for box in boxes]))))
     random = np.random.default_rng(0)
     grips = random.uniform([-0.3, -0.008, 0.02], [0.5, 0.008, 0.06], (300, 3))
     widths = random.uniform(0.05, 0.09, 300)
     # Away from where a point of a finger decides, by half of a point's distance.
-    x, z, side = grips[:, 0], grips[:, 2], 0.5 * widths - np.abs(grips[:, 1]) - 0.5 * SIDES[1]
+    x = grips[:, 0]
+    z = grips[:, 2]
+    side = 0.5 * widths - np.abs(grips[:, 1]) - 0.5 * SIDES[1]
     ends = np.abs(np.abs(x[:, None] - boxes) - 0.5 * SIDES[0]).min(axis=1)
     clear = (np.abs(z - 0.04) > 0.002) & (ends > 0.012) & (np.abs(side) > 0.002)
     down = compose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
     poses = shifted(grips) @ down
-    chance, lower, upper = belief.grasp_chance(poses, widths, gripper)
-    expected = [works(g, w, boxes, gripper) for g, w in zip(grips, widths, strict=True)]
+    chance, lower, upper = belief.grasp_chance(poses, widths, gripper=gripper)
+    expected = [
+        works(g, w, boxes=boxes, gripper=gripper) for g, w in zip(grips, widths, strict=True)
+    ]
     np.testing.assert_allclose(chance[clear], np.array(expected)[clear])
     assert {0.0, 1 / 3, 2 / 3} <= set(np.round(chance[clear], 12)) | {1 / 3, 2 / 3}
     assert ((lower <= chance) & (chance <= upper)).all()
@@ -133,7 +155,9 @@ def test_grasps_of_boxes_are_right_by_intervals():
 
 
 def test_an_interval_is_wilsons():
-    share, count, normal = np.array([0.8, 0.3, 0.0]), 30, norm.ppf(0.95)
+    share = np.array([0.8, 0.3, 0.0])
+    count = 30
+    normal = norm.ppf(0.95)
     for end in wilson(share, count)[1:]:  # where the share is as many deviations away
         away = (share - end) ** 2
         np.testing.assert_allclose(away, normal**2 * end * (1.0 - end) / count, atol=1e-12)
@@ -171,7 +195,9 @@ def test_a_member_counts_for_the_mode_that_it_is_not_turned_against():
     knob = trimesh.creation.box(bounds=[[0.06, -0.03, 0.03], [0.10, 0.03, 0.06]])
     grid = SdfGrid.from_mesh(trimesh.boolean.union([BOX, knob], engine="manifold"), 0.004)
     shift = compose(np.eye(3), np.array([0.0, 0.03, 0.0]))
-    first, second, third = np.eye(4), shift @ HALF_TURN, shift
+    first = np.eye(4)
+    second = shift @ HALF_TURN
+    third = shift
     modes = PoseBelief(grid, result(np.stack([first, second, third]), (0, 1))).modes
     assert [mode.members.tolist() for mode in modes] == [[0, 2], [1]]
     assert modes[0].deviations == pytest.approx((0.03 / np.sqrt(2.0), 0.0), abs=1e-6)
@@ -226,7 +252,7 @@ def test_shifts_and_turns_of_one_sign_have_a_covariance_above_zero():
     turns = rotation_vector(steps[:, 3:]) @ about[:3, :3]
     centre = about[:3, :3] @ symmetry.centre + about[:3, 3]
     poses = compose(turns, centre + steps[:, :3] - turns @ symmetry.centre)
-    (mode,) = PoseBelief(L_GRID, result(poses, verdict="determined"), symmetry).modes
+    (mode,) = PoseBelief(L_GRID, result(poses, verdict="determined"), symmetry=symmetry).modes
     expected = (steps[:, :, None] * steps[:, None]).mean(axis=0)
     np.testing.assert_allclose(mode.covariance, expected, atol=1e-9)
     assert mode.covariance[0, 5] > 1e-4
@@ -236,5 +262,5 @@ def test_a_half_turn_about_an_axis_of_the_object_is_none_of_a_tilted_box():
     symmetry = object_symmetry(BOX)
     turns = compose(axis_angle(np.eye(3), np.full(3, math.pi)), np.zeros((3, 3)))
     poses = TILTED @ np.concatenate([np.eye(4)[None], turns])
-    (mode,) = PoseBelief(GRID, result(poses, verdict="determined"), symmetry).modes
+    (mode,) = PoseBelief(GRID, result(poses, verdict="determined"), symmetry=symmetry).modes
     assert np.abs(mode.covariance).max() < 1e-8

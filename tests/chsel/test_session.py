@@ -19,13 +19,14 @@ BOX = trimesh.creation.box(SIDES)
 TRUTH = compose(axis_angle(np.array([0.0, 0.0, 1.0]), 0.3), np.array([0.4, 0.1, 0.1]))
 CONTACTS = apply(TRUTH, np.asarray(trimesh.sample.sample_surface(BOX, 20, seed=0)[0]))
 HAND = trimesh.creation.box((0.01, 0.01, 0.06))
-CAMERA = chsel.PinholeCamera(80, 60, 90.0, 90.0, 39.5, 29.5)
+CAMERA = chsel.PinholeCamera(80, 60, fx=90.0, fy=90.0, cx=39.5, cy=29.5)
 LOOK = compose(np.array([[0.0, -0.6, 0.8], [-1.0, 0.0, 0.0], [0.0, -0.8, -0.6]]), [0.0, 0.1, 0.4])
 
 
 def ray_lengths(origins, directions):
     """How far rays (N, 3) go until they meet the box at its true pose, by slabs; inf for a miss."""
-    place, along = (origins - TRUTH[:3, 3]) @ TRUTH[:3, :3], directions @ TRUTH[:3, :3] + 1e-12
+    place = (origins - TRUTH[:3, 3]) @ TRUTH[:3, :3]
+    along = directions @ TRUTH[:3, :3] + 1e-12
     ends = (np.array([[[-0.5]], [[0.5]]]) * SIDES - place) / along
     enters, leaves = ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)
     return np.where((enters > 0.0) & (enters < leaves), enters, np.inf)
@@ -33,7 +34,8 @@ def ray_lengths(origins, directions):
 
 def touched(session, probe):
     """Make a probe with HAND, and add where it meets the box."""
-    start, along = probe.world_from_hand, probe.world_from_hand[:3, 2]
+    start = probe.world_from_hand
+    along = probe.world_from_hand[:3, 2]
     way = ray_lengths(start[None, :3, 3], along[None])[0] - 0.03  # of its front
     end = compose(start[:3, :3], start[:3, 3] + min(way, probe.length) * along)
     contact = end[:3, 3] + 0.03 * along if way < probe.length else None
@@ -43,7 +45,8 @@ def touched(session, probe):
 def test_what_is_added_is_what_is_registered():
     session = chsel.Session(BOX, seed=3)
     session.add(contacts=CONTACTS[:5], contact=CONTACTS[5])
-    first, given = session.register(), {"workspace": session.started.workspace, "seed": 3}
+    first = session.register()
+    given = {"workspace": session.started.workspace, "seed": 3}
     assert session.register() is first
     expected = chsel.register(BOX, contacts=CONTACTS[:6], **given)
     assert first.digest == expected.digest
@@ -123,7 +126,8 @@ def test_what_was_added_is_in_the_file_when_add_returns_and_also_how_it_failed(t
 
 def test_touches_by_the_policy_are_verified_also_where_other_actions_are_offered(tmp_path):
     policy = chsel.build_policy("information", {"actions": {"most": 40}})
-    bounds, chosen = chsel.Workspace((0.25, -0.05, 0.0), (0.55, 0.25, 0.25)), []
+    bounds = chsel.Workspace((0.25, -0.05, 0.0), (0.55, 0.25, 0.25))
+    chosen = []
     given = {"hand": HAND, "workspace": bounds, "record": tmp_path / "touches.mcap"}
     with chsel.Session(BOX, policy=policy, settings={"size": "small"}, **given) as session:
         whole = session.actions()
@@ -143,10 +147,12 @@ def test_touches_by_the_policy_are_verified_also_where_other_actions_are_offered
 
 
 def test_a_depth_image_and_two_touches_give_the_pose():
-    rays, eye = CAMERA.directions().reshape(-1, 3) @ LOOK[:3, :3].T, LOOK[:3, 3]
+    rays = CAMERA.directions().reshape(-1, 3) @ LOOK[:3, :3].T
+    eye = LOOK[:3, 3]
     box = ray_lengths(eye[None], rays)
     floor = np.where(rays[:, 2] < 0.0, -eye[2] / rays[:, 2], np.inf)
-    depth, mask = np.minimum(box, floor).reshape(60, 80), np.isfinite(box).reshape(60, 80)
+    depth = np.minimum(box, floor).reshape(60, 80)
+    mask = np.isfinite(box).reshape(60, 80)
     session = chsel.Session(BOX)
     session.add(depth=depth, mask=mask, camera=CAMERA, world_from_camera=LOOK)
     points = session.points
@@ -178,7 +184,7 @@ def test_a_hand_leaves_free_the_voxels_whose_centres_it_passed():
 def test_a_failed_registration_is_an_error_and_the_next_one_goes_on(monkeypatch, tmp_path):
     with chsel.Session(BOX, record=tmp_path / "touches.mcap") as session:
         session.add(contacts=CONTACTS)
-        monkeypatch.setattr(Anchored, "register", lambda *_: 1 / 0)
+        monkeypatch.setattr(Anchored, "register", lambda *_, **__: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             session.register()
         refused("ZeroDivisionError", session.register)

@@ -121,7 +121,8 @@ def test_a_disk_that_is_full_during_a_registration_loses_no_result(tmp_path, mon
 def test_threads_that_add_to_one_session_lose_nothing(tmp_path):
     path = tmp_path / "touches.mcap"
     session = chsel.Session(BOX, record=path, workspace=ROOM, **QUICK)
-    start, failures = threading.Barrier(3), []
+    start = threading.Barrier(3)
+    failures = []
 
     def in_thread(call, times):
         def run():

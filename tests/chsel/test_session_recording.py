@@ -67,7 +67,7 @@ def test_a_recorded_image_has_the_depths_camera_pose_and_rays_that_were_added(
     16 bits hold 6.5 m in tenths of a millimetre.
     """
     height, width = 12, 16
-    camera = chsel.PinholeCamera(width, height, 20.0, 22.0, 7.3, 4.1)
+    camera = chsel.PinholeCamera(width, height, fx=20.0, fy=22.0, cx=7.3, cy=4.1)
     pose = compose(DOWN, np.array([0.1, 0.2, 13.0]))
     depth = np.random.default_rng(0).uniform(top - 0.004, top, (height, width))
     depth[5:7, 8:10] = 0.0
@@ -105,7 +105,7 @@ def test_what_was_swept_is_swept_again_after_a_push_alone(box, finger, recorder)
 
 def test_a_place_of_the_surface_counts_once_whichever_touch_or_image_showed_it(box, recorder):
     """Images of the box from two sides and again from the first one."""
-    camera = chsel.PinholeCamera(40, 30, 40.0, 40.0, 19.5, 14.5)
+    camera = chsel.PinholeCamera(40, 30, fx=40.0, fy=40.0, cx=19.5, cy=14.5)
     eyes = {
         "x": compose(np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]]), np.array([0.4, 0.0, 0.0])),
         "y": compose(np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]]), np.array([0.0, 0.4, 0.0])),

@@ -47,7 +47,8 @@ def test_the_true_object_comes_first(tmp_path):
 
 def test_what_one_object_cannot_have_is_added_to_none():
     """Contacts 21 m apart, which are never those of the smaller object: its diameter is 0.2 m."""
-    small, large = BOX.copy(), BOX.copy().apply_scale(2.0)
+    small = BOX.copy()
+    large = BOX.copy().apply_scale(2.0)
     size = float(np.linalg.norm(small.extents))
     with chsel.WhichObject({"large": large, "small": small}, workspace=WORKSPACE) as which:
         which.add(contacts=apply(TRUTH, on_faces(12)))
@@ -70,7 +71,7 @@ def test_objects_of_other_sizes_are_compared_by_the_same_points():
         counts = {len(session.points.known) for session in which.sessions.values()}
         look = compose(TRUTH[:3, :3], TRUTH[:3, 3] - 0.3 * TRUTH[:3, 2])
         seen = {"depth": np.full((30, 40), 0.26), "mask": np.ones((30, 40))}
-        camera = chsel.PinholeCamera(40, 30, 200.0, 200.0, 19.5, 14.5)
+        camera = chsel.PinholeCamera(40, 30, fx=200.0, fy=200.0, cx=19.5, cy=14.5)
         which.add(**seen, camera=camera, world_from_camera=look)
         places = {s.points.known.tobytes() for s in which.sessions.values()}
     assert counts == {24}
@@ -87,7 +88,8 @@ def test_no_action_is_chosen_by_two_objects():
     with chsel.WhichObject(meshes, workspace=WORKSPACE, hand=finger) as which:
         which.add(contacts=contacts[:3])
         names = [one.name for one in which.register()]
-        every, chosen = which.sessions["box"].actions(), which.next_probe().action
+        every = which.sessions["box"].actions()
+        chosen = which.next_probe().action
         one = chsel.Actions(every.world_from_hand[[chosen]], every.length[[chosen]])
         for contact, name, action in ((3, names[0], 0), (4, names[1], None)):
             which.add(contacts=contacts[contact : contact + 1])
@@ -108,8 +110,10 @@ def test_energies_are_those_of_the_points_where_the_object_is_now(moves):
     distance = 0.5 * moves
     pin = trimesh.creation.box(bounds=[[-2e-3, -2e-3, -0.02], [2e-3, 2e-3, 0.0]])
     local = on_faces(12)[np.arange(12) % 3 < 2]
-    axis, now = np.tile([0, 1], 4), STANDING.copy()
-    noise, method = 0.002, Scripted([inverse(STANDING[None])], 0.002, distance)
+    axis = np.tile([0, 1], 4)
+    now = STANDING.copy()
+    noise = 0.002
+    method = Scripted([inverse(STANDING[None])], 0.002, push_distance=distance)
     meshes = {"slim": trimesh.creation.box(SLIM), "box": BOX}
     given = {"workspace": WORKSPACE, "moves": moves, "method": method, "noise": noise}
     ways = -np.sign(local[np.arange(8), axis])[:, None] * STANDING[:3, axis].T
@@ -126,7 +130,7 @@ def test_energies_are_those_of_the_points_where_the_object_is_now(moves):
     assert [one.name for one in found] == ["box", "slim"]
     for one, sides in zip(found, (BOX_SIDES, SLIM), strict=True):
         residuals = box_distance(local, sides)
-        expected = plain_energy(noise_model(noise), residuals.tolist(), [])
+        expected = plain_energy(noise_model(noise), residuals.tolist(), depths=[])
         assert one.energy == pytest.approx(expected, abs=0.02)
 
 

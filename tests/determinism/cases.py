@@ -56,13 +56,13 @@ def _case(method="chsel", preset="default", at="bracket", **given):
     """A case by its fields; of others, changes. at: the place, and the body that is there."""
     fields = {name: given.pop(name) for name in ("classes", "steps", "long") if name in given}
     body = "mallet" if at == "mallet" else "bracket"
-    return Case(method, preset, given, body, at, **fields)
+    return Case(method, preset, changes=given, body=body, place=at, **fields)
 
 
 _all = partial(_case, classes=ALL_CLASSES)
 
 
-def _on_plane(measure, plane, method="chsel", **more):
+def _on_plane(measure, plane, *, method="chsel", **more):
     return _case(method, at="standing", archive={"measure": measure}, plane=plane, **more)
 
 
@@ -125,8 +125,8 @@ _MEASURES = {name: _case(archive={"measure": name, "bins": bins}) for name, bins
 _PLANES = {
     "plane_position": _on_plane("plane_position", ON_TABLE, steps=2),
     "plane_angle": _on_plane("plane_angle", OBLIQUE),
-    "plane, position_2": _on_plane("position_2", OBLIQUE, "chsel_cma_me"),
-    "plane, object_yaw": _on_plane("object_yaw", ON_TABLE, "chsel_cma_me"),
+    "plane, position_2": _on_plane("position_2", OBLIQUE, method="chsel_cma_me"),
+    "plane, object_yaw": _on_plane("object_yaw", ON_TABLE, method="chsel_cma_me"),
     "plane, object_xy": _on_plane("object_xy", ON_TABLE),
     "plane, position_3": _case(archive={"measure": "position_3", "bins": 8}, plane=OBLIQUE),
     "plane, descent": _case("gradient_descent", at="standing", plane=OBLIQUE),

@@ -24,15 +24,15 @@ def decision_stages(place, sdf):
     problem = posed(place, sdf)
     stages, belief = {}, problem.belief
     parts = {"poses": belief.object_from_world.copy(), "weights": belief.weights.copy()}
-    keep(stages, "belief before", parts)
+    keep(stages, "belief before", arrays=parts)
     problem = replace(problem, belief=_scattered(problem.workspace))
     forecast = Forecast(problem, 0.005)
-    keep(stages, "hand", {"heights": problem.hand.front.heights.copy()})
-    keep(stages, "first contacts", forecast.first._asdict())
-    keep(stages, "chances", {"hit": forecast.hit_chance, "blocked": forecast.blocked_chance})
+    keep(stages, "hand", arrays={"heights": problem.hand.front.heights.copy()})
+    keep(stages, "first contacts", arrays=forecast.first._asdict())
+    keep(stages, "chances", arrays={"hit": forecast.hit_chance, "blocked": forecast.blocked_chance})
     spread = {"between": forecast.distances, "spread": np.array([forecast.spread])}
-    keep(stages, "distances", spread)
-    keep(stages, "gains", forecast.gains._asdict())
+    keep(stages, "distances", arrays=spread)
+    keep(stages, "gains", arrays=forecast.gains._asdict())
     cases = {f"forecast, {place}": stages}
     for name in OURS:
         policy = build_policy(name, {"stop": {"spread": 0.0, "gain": 0.0}})
@@ -41,7 +41,7 @@ def decision_stages(place, sdf):
         arrays = {name: getattr(decision, name) for name in names}
         first = decision.contacts[0]
         outcomes = (None, np.nan_to_num(first), np.nan_to_num(first + 0.02))
-        nats = [surprise(problem, decision, 0.005, outcome) for outcome in outcomes]
+        nats = [surprise(problem, decision, noise=0.005, contact=outcome) for outcome in outcomes]
         arrays |= {"chosen": np.array([float(decision.chosen)]), "surprise": np.array(nats)}
         cases[f"{name}, {place}"] = {"decision": arrays}
     return cases
@@ -50,15 +50,19 @@ def decision_stages(place, sdf):
 def posed(place, sdf):
     """A scene before any registration: actions along an axis and obliquely, a pyramid as hand."""
     points, workspace, resolution = scene(place, ("contacts", "free"))
-    belief = belief_before(sdf, points, workspace, KEY, BeliefSettings(poses=_POSES))
+    belief = belief_before(
+        sdf, points, workspace=workspace, key=KEY, settings=BeliefSettings(poses=_POSES)
+    )
     lower, upper = workspace.bounds
     stream = KEY.stream(Purpose.PLAUSIBLE_ROTATIONS)
-    starts = uniforms(stream, lower, upper, (2 * _STARTS, 3))
+    starts = uniforms(stream, lower, upper=upper, shape=(2 * _STARTS, 3))
     turned = axis_angle(np.array([0.36, 0.48, 0.8]), np.array(0.7))
     turns = np.repeat([np.eye(3), turned], _STARTS, axis=0)
     starts = starts - 0.5 * (upper - lower).max() * turns[:, :, 2]
-    lengths = uniforms(stream, 0.2, 0.8, len(starts))
-    actions = Actions(compose(turns, starts), lengths, uniforms(stream, 1.0, 3.0, len(starts)))
+    lengths = uniforms(stream, 0.2, upper=0.8, shape=len(starts))
+    actions = Actions(
+        compose(turns, starts), lengths, seconds=uniforms(stream, 1.0, upper=3.0, shape=len(starts))
+    )
     return DecisionProblem(
         sdf=sdf,
         points=points,
@@ -76,7 +80,7 @@ def _scattered(workspace):
     """Poses around one in the middle of the workspace, of unequal weights."""
     stream = KEY.stream(Purpose.WALKS)
     middle = 0.5 * (workspace.bounds[0] + workspace.bounds[1])
-    few = axis_angle(np.array([0.0, 0.6, 0.8]), uniforms(stream, -0.4, 0.4, _POSES))
+    few = axis_angle(np.array([0.0, 0.6, 0.8]), uniforms(stream, -0.4, upper=0.4, shape=_POSES))
     turns = product(few, random_rotations(stream, 1))
     poses = inverse(compose(turns, middle + 0.02 * normals(stream, (_POSES, 3))))
     weights = np.arange(_POSES) % 4 / 1.0

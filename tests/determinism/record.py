@@ -109,13 +109,13 @@ def main():
     kept = {body: grid(body) for body in {case.body for case in CASES.values()}}
     if arguments.again:
         for case in reversed(CASES.values()):
-            run(case, kept[case.body], nobody)
+            run(case, kept[case.body], watch=nobody)
         for place in reversed(SCENES):
             decision_stages(place, kept[place])
     record = {}
     for name, case in CASES.items():
         sdf = kept[case.body] if arguments.again else grid(case.body)
-        record[name] = condensed(run(case, sdf, WATCHES[arguments.watch]))
+        record[name] = condensed(run(case, sdf, watch=WATCHES[arguments.watch]))
     for place in SCENES:
         stages = decision_stages(place, kept[place] if arguments.again else grid(place))
         record |= {case: condensed(each) for case, each in stages.items()}

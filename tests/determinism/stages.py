@@ -52,7 +52,11 @@ def scene(place, classes):
     free, occupied = points("free", "free"), points("occupied", "occupied")
     lower, upper = _stored()[f"points/{place}/workspace"].tolist()
     resolution = float(_stored()[f"points/{place}/free_resolution"])
-    return KnownPoints(free, occupied, known, known_sdf), Workspace(lower, upper), resolution
+    return (
+        KnownPoints(free, occupied, known=known, known_sdf=known_sdf),
+        Workspace(lower, upper),
+        resolution,
+    )
 
 
 class StageKeeper:
@@ -75,7 +79,7 @@ class StageKeeper:
         self._keep(f"archive {archive.iteration}", archive_arrays(archive))
 
     def _keep(self, name, arrays):
-        keep(self._stages, f"step {self._step}: {name}", arrays)
+        keep(self._stages, f"step {self._step}: {name}", arrays=arrays)
 
 
 class Scribbler(NullObserver):
@@ -100,25 +104,31 @@ def nobody(stages, case, step):
 
 def run(case, sdf, watch=StageKeeper):
     """All stages of a case; those within a registration as far as the observer keeps them."""
-    method, stages, found = case.build(), {}, None
+    method = case.build()
+    stages = {}
+    found = None
     where = scene(case.place, case.classes)
     for step in range(case.steps):
         problem = pose_problem(sdf, *where, StreamKey(11, step), method.online, found)
         if watch is StageKeeper:
-            _keep_start(stages, method.settings, problem, step)
+            _keep_start(stages, method.settings, problem=problem, step=step)
         found = method.register(problem, watch(stages, case, step))
         if found.archive is not None:
-            keep(stages, f"step {step}: last archive", archive_arrays(found.archive))
+            keep(stages, f"step {step}: last archive", arrays=archive_arrays(found.archive))
         names = ("object_from_world", "cost", "duplicate", "cell", "elites")
-        keep(stages, f"step {step}: hypotheses", {name: getattr(found, name) for name in names})
+        keep(
+            stages,
+            f"step {step}: hypotheses",
+            arrays={name: getattr(found, name) for name in names},
+        )
     return stages
 
 
-def _keep_start(stages, settings, problem, step):
+def _keep_start(stages, settings, *, problem, step):
     """E_0 and E_l, and what the kernels say about E_0."""
 
     def keep_as(name, **arrays):
-        keep(stages, f"step {step}: {name}", arrays)
+        keep(stages, f"step {step}: {name}", arrays=arrays)
 
     keep_as("initial sets", E_0=problem.initial_set, E_l=problem.low_cost_set)
     keep_as("normal draws", draws=normals(problem.key.stream(Purpose.EMITTER), 3000))
@@ -143,7 +153,7 @@ def archive_arrays(archive):
     return {name: getattr(archive, name).copy() for name in names}
 
 
-def keep(stages, name, arrays):
+def keep(stages, name, *, arrays):
     """Add a stage; one that comes again, in a later pass, is numbered."""
     unique, number = name, 1
     while unique in stages:

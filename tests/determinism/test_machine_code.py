@@ -73,23 +73,40 @@ def code():
     """Optimised code, with that of their callees, of the kernels that Python calls."""
     for name in ENOUGH:
         run(CASES[name], grid(CASES[name].body))
-    sdf, first = grid("bracket"), np.eye(4)[None]
+    sdf = grid("bracket")
+    first = np.eye(4)[None]
     decision_stages("bracket", sdf)
     points, workspace, resolution = scene("bracket", ("contacts", "free"))
-    key, depth, seen = StreamKey(11, 0), np.ones((3, 4)), np.ones((3, 4), dtype=bool)
-    occlusion_edges(depth, seen, 0.1)
+    key = StreamKey(11, 0)
+    depth = np.ones((3, 4))
+    seen = np.ones((3, 4), dtype=bool)
+    occlusion_edges(depth, seen, jump=0.1)
     space = FreeGrid(workspace, 0.05)
-    space.from_depth(depth, PinholeCamera(4, 3, 5.0, 5.0, 2.0, 1.5), first[0], seen)
+    space.from_depth(
+        depth,
+        PinholeCamera(4, 3, fx=5.0, fy=5.0, cx=2.0, cy=1.5),
+        world_from_camera=first[0],
+        mask=seen,
+    )
     space.along_rays(np.zeros(3), np.ones((1, 3)))
     space.at(np.zeros((1, 3)))
-    problem = RegistrationProblem(sdf, points, first, workspace, resolution, key)
+    problem = RegistrationProblem(
+        sdf=sdf,
+        points=points,
+        initial_set=first,
+        workspace=workspace,
+        free_resolution=resolution,
+        key=key,
+    )
     trust_in(problem, hypotheses_at(first))
     poses = PoseGridSettings(rotations=5, upright=2)
-    members = plausible_set(problem, first[0], PlausibleSettings(epsilon=10.0, grid=poses))
-    surface = surface_points(sdf, 4, key.stream(Purpose.METRIC_POINTS))
+    members = plausible_set(problem, first[0], settings=PlausibleSettings(epsilon=10.0, grid=poses))
+    surface = surface_points(sdf, 4, stream=key.stream(Purpose.METRIC_POINTS))
     for method in ("grid", "exact"):
         settings = DistanceSettings(method=method)
-        distance = SurfaceDistance(sdf, trimesh.creation.box((0.1,) * 3), surface, settings)
+        distance = SurfaceDistance(
+            sdf, trimesh.creation.box((0.1,) * 3), points=surface, settings=settings
+        )
         distance.between(first, members.world_from_object)
     return {name: optimised(kernel) for name, kernel in _from_python().items()}
 

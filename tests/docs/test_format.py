@@ -26,7 +26,8 @@ def varints(data):
     """The integers that bytes hold, seven bits a byte, the lowest first."""
     value = shift = 0
     for byte in data:
-        value, shift = value | (byte & 127) << shift, shift + 7
+        value = value | (byte & 127) << shift
+        shift = shift + 7
         if byte < 128:
             yield value
             value = shift = 0
@@ -34,7 +35,8 @@ def varints(data):
 
 def decode(name, data):
     """The fields of a message that are there."""
-    found, data = {}, iter(data)
+    found = {}
+    data = iter(data)
     while tag := next(varints(data), None):
         size = {1: 8, 5: 4}.get(tag & 7) or next(varints(data))
         value = bytes(islice(data, size)) if tag & 7 else size
@@ -67,7 +69,8 @@ def test_the_tables_are_those_of_the_code():
 
 @pytest.mark.parametrize("name", ["mustard_anchored", "box_steered"])
 def test_what_the_pages_say_is_enough_to_read(name):
-    path, topics = REPOSITORY / "tests" / "replays" / f"{name}.mcap", defaultdict(list)
+    path = REPOSITORY / "tests" / "replays" / f"{name}.mcap"
+    topics = defaultdict(list)
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         for schema, channel, stamped in reader.iter_messages(log_time_order=False):
@@ -75,7 +78,8 @@ def test_what_the_pages_say_is_enough_to_read(name):
             if kind in FIELDS or channel.topic.startswith("/points/"):
                 topics[channel.topic].append(decode(kind, stamped.data))
         grid = next(a.data for a in reader.iter_attachments() if a.name == "sdf_grid")
-    ours, equal = read_recording(path), np.testing.assert_array_equal
+    ours = read_recording(path)
+    equal = np.testing.assert_array_equal
     grid = {
         name: np.array(value, "<f8", ndmin=1) for name, value in decode("SdfGrid", grid).items()
     }

@@ -48,8 +48,10 @@ def shell(command, folder, **variables):
 
 def followed(page, folder):
     """The folder, with all blocks of a page written that a line such as "`name.py`:" stands before,
-    and the lines of its sh blocks run."""
-    text, commands = (REPOSITORY / "docs" / page).read_text(), ""
+    and the lines of its sh blocks run.
+    """
+    text = (REPOSITORY / "docs" / page).read_text()
+    commands = ""
     for block in BLOCK.finditer(text):
         if named := NAMED.search(text[: block.start()]):
             path = folder / named["name"]
@@ -116,10 +118,15 @@ def test_verify_finds_a_method_that_was_changed(method):
 
 
 def test_without_the_package_the_recording_can_still_be_read(method, tmp_path):
-    path, exported = str(method[1][10].path), str(tmp_path / "out.json")
+    path = str(method[1][10].path)
+    exported = str(tmp_path / "out.json")
     assert run(replay, "info", path).returncode == 0
-    export = ("export", path, "--what", "hypotheses", "--format", "json", "-o", exported)
-    assert run(replay, *export).returncode == 0
+    assert (
+        run(
+            replay, "export", path, "--what", "hypotheses", "--format", "json", "-o", exported
+        ).returncode
+        == 0
+    )
     done = run(replay, "verify", path)
     assert done.returncode == 2
     assert "method is 'hill_climb'; accepted: chsel," in done.stderr

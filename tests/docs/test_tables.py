@@ -55,7 +55,8 @@ def sections(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_and_named_sections_exist(page):
-    text, dead = page.read_text(), []
+    text = page.read_text()
+    dead = []
     for link in LINK.finditer(text):
         to = (page.parent / link["path"]).resolve() if link["path"] else page
         if not to.exists() or (link["section"] and link["section"] not in sections(to)):
@@ -91,7 +92,8 @@ def test_every_policy_setting_and_reason_to_stop_is_there():
 
 
 def test_the_program_of_the_next_probe_stops_where_the_object_is_found():
-    mesh, truth = trimesh.creation.box(extents=(0.1, 0.12, 0.2)), np.eye(4)
+    mesh = trimesh.creation.box(extents=(0.1, 0.12, 0.2))
+    truth = np.eye(4)
     truth[2, 3] = 0.1
     (program,) = re.findall(r"```python\n(.*?)```", NEXT_PROBE, re.DOTALL)
     names = {"mesh": mesh, "gripper_mesh": FINGER, "robot": FakeRobot(mesh, truth)}
@@ -179,11 +181,18 @@ def test_objects_that_moved_are_judged_from_six_touches_on(tmp_path, monkeypatch
     hits = [True, True, False, True, True, True, True, True]  # the sixth is the seventh probe
     columns = {"hit": hits, "best_error": [0.5] * 6 + [0.004, 0.012]}
     rows = session(
-        "can", 40, "random", [90.0] * 6 + [8.0, 30.0], verdict=["determined"] * 8, **columns
+        "can",
+        40,
+        policy="random",
+        errors=[90.0] * 6 + [8.0, 30.0],
+        verdict=["determined"] * 8,
+        **columns,
     )
     columns["best_error"] = [0.5] * 6 + [0.006, 0.002]
-    rows += session("can", 41, "random", [90.0] * 6 + [2.0, 4.0], verdict=["wide"] * 8, **columns)
-    write_sessions(tmp_path / "made_up", rows, {"random": 8})
+    rows += session(
+        "can", 41, policy="random", errors=[90.0] * 6 + [2.0, 4.0], verdict=["wide"] * 8, **columns
+    )
+    write_sessions(tmp_path / "made_up", rows, budgets={"random": 8})
     monkeypatch.setattr(make, "KEPT", tmp_path)
     make.evaluation.cache_clear()
     found = [make.moved("made_up", column) for column in ("best_error", "error")]
@@ -194,7 +203,7 @@ def test_objects_that_moved_are_judged_from_six_touches_on(tmp_path, monkeypatch
 
 def test_seeds_of_a_method_are_those_that_it_ran_on(tmp_path, monkeypatch):
     seeds = {"icp": (3, 5, 4), "cvo": (4,)}
-    rows = [row("can", seed, name, 0) for name, own in seeds.items() for seed in own]
+    rows = [row("can", seed, method=name, step=0) for name, own in seeds.items() for seed in own]
     write_evaluation(tmp_path / "made_up", rows, methods={"icp": {}, "cvo": {}})
     monkeypatch.setattr(make, "KEPT", tmp_path)
     make.evaluation.cache_clear()

@@ -63,20 +63,28 @@ def example_events(*, steps=3, elites=12, free=40, snapshots=2):
         world_from_object=_poses(random, 1)[0],
         environment={"torch": "2.13.0", "numpy": "2.4.6", "platform": "Linux"},
     )
-    events: list[Event] = [start, Logged(-1, "info", "ready — los geht's")]
-    points, low_cost_set = start.initial_points, np.zeros((0, 4, 4))
+    events: list[Event] = [start, Logged(-1, "info", text="ready — los geht's")]
+    points = start.initial_points
+    low_cost_set = np.zeros((0, 4, 4))
     for step in range(steps):
-        probe = _probe(random, step, free)
+        probe = _probe(random, step, free=free)
         points = points.merged(probe.new_points)
         events.append(probe)
         if step > 0:
-            given = (start.sdf, points, _poses(random, 5), WORKSPACE, FREE_RESOLUTION)
-            problem = RegistrationProblem(*given, StreamKey(start.seed, step), low_cost_set)
-            found = _registration(random, problem, elites, snapshots)
+            problem = RegistrationProblem(
+                sdf=start.sdf,
+                points=points,
+                initial_set=_poses(random, 5),
+                workspace=WORKSPACE,
+                free_resolution=FREE_RESOLUTION,
+                key=StreamKey(start.seed, step),
+                low_cost_set=low_cost_set,
+            )
+            found = _registration(random, problem, elites=elites, snapshots=snapshots)
             low_cost_set = found[-1].hypotheses.elites
             events += [*found, Timed(step, {"registration": random.uniform()})]
             events.append(Measured(step, {"best_cost": -0.0, "coverage_mm2": float("nan")}))
-    return [*events, Logged(steps - 1, "warning", ""), SessionEnded(steps - 1, "finished")]
+    return [*events, Logged(steps - 1, "warning", text=""), SessionEnded(steps - 1, "finished")]
 
 
 def bare_events():
@@ -90,15 +98,23 @@ def bare_events():
         object="",
     )
     point = KnownPoints(occupied=[[0.0, -0.0, 5e-324]])
-    given = (start.sdf, point, np.eye(4)[None], WORKSPACE, FREE_RESOLUTION)
-    problem = RegistrationProblem(*given, StreamKey(0, 0))
-    poses, flags, cells = np.zeros((0, 4, 4)), np.zeros(0, dtype=bool), np.zeros(0, dtype=np.int64)
-    nothing = Hypotheses(poses, np.zeros(0), flags, cells, poses)
-    empty_archive = _archive(np.random.default_rng(0), 0, 0)
+    problem = RegistrationProblem(
+        sdf=start.sdf,
+        points=point,
+        initial_set=np.eye(4)[None],
+        workspace=WORKSPACE,
+        free_resolution=FREE_RESOLUTION,
+        key=StreamKey(0, 0),
+    )
+    poses = np.zeros((0, 4, 4))
+    flags = np.zeros(0, dtype=bool)
+    cells = np.zeros(0, dtype=np.int64)
+    nothing = Hypotheses(poses, np.zeros(0), duplicate=flags, cell=cells, elites=poses)
+    empty_archive = _archive(np.random.default_rng(0), 0, elites=0)
     return [
         start,
-        Probe(0, "free", KnownPoints()),
-        Probe(1, "points", point),
+        Probe(0, "free", new_points=KnownPoints()),
+        Probe(1, "points", new_points=point),
         ProblemPosed(1, problem),
         SnapshotTaken(1, empty_archive),
         HypothesesFound(1, nothing),
@@ -118,25 +134,37 @@ def with_sensors(events):
                 pose = _poses(random, 1)[0]
                 intrinsics = np.array([500.0, 501.0, 3.5, -0.5])
                 mask = random.uniform(size=values.shape) < 0.5
-                seen = (values, 0.001, mask, intrinsics, pose)
-                made.append(SensorImage(event.step, sensor, kind, *seen))
+                made.append(
+                    SensorImage(
+                        step=event.step,
+                        sensor=sensor,
+                        kind=kind,
+                        values=values,
+                        unit=0.001,
+                        mask=mask,
+                        intrinsics=intrinsics,
+                        world_from_camera=pose,
+                    )
+                )
         made.append(event)
         if isinstance(event, SessionStarted):
-            made.append(RigDescribed(-1, "cabinet", "sha256:0a1b", hand))
+            made.append(RigDescribed(-1, "cabinet", source="sha256:0a1b", hand=hand))
     return made
 
 
 def with_decisions(events):
     """The same session steered: actions are offered, and a decision follows each step's results."""
-    random, actions, poses = np.random.default_rng(13), 4, 3
+    random = np.random.default_rng(13)
+    actions = 4
+    poses = 3
     starting = sum(isinstance(event, SessionStarted | RigDescribed) for event in events)
     start = events[0]
     start = dataclasses.replace(start, config={**start.config, "policy": {"name": "dice"}})
     hand = HandShape.of(trimesh.creation.icosphere(subdivisions=1, radius=0.05))
     length = random.uniform(0.1, 0.5, actions)
-    offered = Actions(_poses(random, actions), length, length + 1.0)
+    offered = Actions(_poses(random, actions), length, seconds=length + 1.0)
     points, probed = start.initial_points, -1
-    made: list[Event] = [start, *events[1:starting], ActionsOffered(-1, offered, hand)]
+    made: list[Event] = [start, *events[1:starting], ActionsOffered(-1, offered, hand=hand)]
 
     def decided(*, stop=""):
         belief = WeightedPoses(_poses(random, poses), np.full(poses, 1.0 / poses))
@@ -144,18 +172,30 @@ def with_decisions(events):
         chosen = -1 if stop else (probed + 1) % actions
         contacts = random.normal(size=(poses, 3))
         contacts[0] = np.nan
+        chances = random.uniform(size=(3, actions))
         decision = Decision(
-            chosen,
-            stop,
-            random.uniform(),
-            np.where(available, random.normal(size=actions), -np.inf),
-            *random.uniform(size=(3, actions)),
+            chosen=chosen,
+            stop=stop,
+            spread=random.uniform(),
+            score=np.where(available, random.normal(size=actions), -np.inf),
+            hit_chance=chances[0],
+            blocked_chance=chances[1],
+            expected_spread=chances[2],
             contacts=np.zeros((0, 3)) if stop else contacts,
         )
-        given = (start.sdf, points, start.workspace, start.free_resolution)
         key = StreamKey(start.seed, probed + 1)
-        problem = DecisionProblem(*given, belief, offered, available, hand, key)
-        return Decided(probed, problem, decision, random.uniform(0.0, 9.0))
+        problem = DecisionProblem(
+            sdf=start.sdf,
+            points=points,
+            workspace=start.workspace,
+            free_resolution=start.free_resolution,
+            belief=belief,
+            actions=offered,
+            available=available,
+            hand=hand,
+            key=key,
+        )
+        return Decided(probed, problem, decision=decision, surprise=random.uniform(0.0, 9.0))
 
     for event in events[starting:]:
         if event.step > probed or isinstance(event, SessionEnded):
@@ -167,7 +207,7 @@ def with_decisions(events):
     return made
 
 
-def nth(events, kind, number=0):
+def nth(events, kind, *, number=0):
     """One of the events of a kind."""
     return [event for event in events if isinstance(event, kind)][number]
 
@@ -202,7 +242,7 @@ def _poses(random, count):
     return compose(random_rotations(random, count), random.normal(size=(count, 3)))
 
 
-def _probe(random, step, free):
+def _probe(random, step, *, free):
     contacts = random.normal(size=(step, 3))
     known = np.concatenate([contacts, random.normal(size=(step, 3))])
     new = KnownPoints(
@@ -212,17 +252,31 @@ def _probe(random, step, free):
         known_sdf=np.repeat([0.0, 0.01], step),
     )
     outcome = "contact" if step else "free"
-    return Probe(step, outcome, new, _poses(random, 4), contacts, -contacts)
+    return Probe(
+        step,
+        outcome,
+        new_points=new,
+        gripper_path=_poses(random, 4),
+        contacts=contacts,
+        contact_normals=-contacts,
+    )
 
 
-def _registration(random, problem, elites, snapshots):
+def _registration(random, problem, *, elites, snapshots):
     step = problem.key.step
-    costs = (0.1, np.pi, 1e9)
     events: list[Any] = [
         ProblemPosed(step, problem),
-        Traced(step, "descent", 100, digest(problem.initial_set), *costs),
+        Traced(
+            step,
+            "descent",
+            iteration=100,
+            digest=digest(problem.initial_set),
+            lowest_cost=0.1,
+            median_cost=np.pi,
+            highest_cost=1e9,
+        ),
     ]
-    archives = [_archive(random, 10 * i, elites) for i in range(snapshots)]
+    archives = [_archive(random, 10 * i, elites=elites) for i in range(snapshots)]
     events += [SnapshotTaken(step, archive) for archive in archives]
     found = Hypotheses(
         object_from_world=_poses(random, 5),
@@ -235,7 +289,7 @@ def _registration(random, problem, elites, snapshots):
     return [*events, HypothesesFound(step, found)]
 
 
-def _archive(random, iteration, elites):
+def _archive(random, iteration, *, elites):
     return ArchiveSnapshot(
         iteration=iteration,
         refinement=1,

@@ -88,7 +88,8 @@ def test_a_recorded_belief_becomes_that_of_todays_result(stored, write, tmp_path
 @pytest.mark.usefixtures("other_code")
 @pytest.mark.parametrize(("answer", "status"), [("\n", 1), ("y\n", 0)])
 def test_it_asks(stored, answer, status, monkeypatch):
-    before, terminal = stored.read_bytes(), io.StringIO(answer)
+    before = stored.read_bytes()
+    terminal = io.StringIO(answer)
     monkeypatch.setattr(terminal, "isatty", lambda: True)
     monkeypatch.setattr(sys, "stdin", terminal)
     assert main(["accept", str(stored)]) == status
@@ -110,7 +111,8 @@ def test_where_nobody_can_answer_or_a_file_is_not_whole_nothing_is_done(
 
 
 def test_a_robots_session_is_verified_and_accepted_with_its_rig_and_images(write, tmp_path):
-    path, new = write(robot_session("gradient_descent")), tmp_path / "new.mcap"
+    path = write(robot_session("gradient_descent"))
+    new = tmp_path / "new.mcap"
     assert main(["verify", str(path)]) == 0
     write_accepted(read_recording(path), new)
     found, before = (
@@ -134,9 +136,12 @@ def turned(degrees, shift=0.0):
 
 def found(*poses):
     count = len(poses)
-    cost, duplicate = np.arange(float(count)), np.zeros(count, dtype=bool)
+    cost = np.arange(float(count))
+    duplicate = np.zeros(count, dtype=bool)
     stacked = np.array(poses).reshape(-1, 4, 4)
-    return Hypotheses(stacked, cost, duplicate, np.full(count, -1), np.zeros((0, 4, 4)))
+    return Hypotheses(
+        stacked, cost, duplicate=duplicate, cell=np.full(count, -1), elites=np.zeros((0, 4, 4))
+    )
 
 
 def test_recorded_errors_are_modulo_the_symmetries_of_the_object_at_its_centre():
@@ -147,12 +152,12 @@ def test_recorded_errors_are_modulo_the_symmetries_of_the_object_at_its_centre()
             return found(turned(180.0, 0.03), turned(10.0))
 
     problem = RegistrationProblem(
-        SdfGrid.from_mesh(BOX, 0.01, padding=0.03),
-        KnownPoints(known=[[0.0, 0.0, 0.0]]),
-        turned(0.0)[None],
-        Workspace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)),
-        0.01,
-        StreamKey(0, 1),
+        sdf=SdfGrid.from_mesh(BOX, 0.01, padding=0.03),
+        points=KnownPoints(known=[[0.0, 0.0, 0.0]]),
+        initial_set=turned(0.0)[None],
+        workspace=Workspace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)),
+        free_resolution=0.01,
+        key=StreamKey(0, 1),
     )
     recorder = ListRecorder()
     registered = register_recorded(
@@ -171,7 +176,11 @@ def test_recorded_errors_are_modulo_the_symmetries_of_the_object_at_its_centre()
 
 
 def test_how_far_the_best_pose_moves():
-    pair, symmetry = (found(turned(180.0)), found(turned(20.0, 0.004))), object_symmetry(BOX)
+    pair = (found(turned(180.0)), found(turned(20.0, 0.004)))
+    symmetry = object_symmetry(BOX)
     moves = 0.004, pytest.approx(np.deg2rad(20.0), abs=1e-6)
-    assert best_pose_moves(*pair, symmetry) == (pytest.approx(moves[0], abs=1e-9), moves[1])
-    assert np.isnan(best_pose_moves(pair[0], found(), symmetry)).all()
+    assert best_pose_moves(pair[0], pair[1], symmetry=symmetry) == (
+        pytest.approx(moves[0], abs=1e-9),
+        moves[1],
+    )
+    assert np.isnan(best_pose_moves(pair[0], found(), symmetry=symmetry)).all()

@@ -77,8 +77,8 @@ def test_all_sets_are_judged_by_the_recorded_cost(path):
     recording = read_recording(path)
     cost = common_cost(recording)
     assert cost.settings == dataclasses.replace(CostSettings(), **COST)
-    methods = chosen(recording, METHOD, ["chsel", "chsel@paper"])
-    outcomes = list(compared(recording, methods, recording.steps, cost))
+    methods = chosen(recording, METHOD, words=["chsel", "chsel@paper"])
+    outcomes = list(compared(recording, methods, steps=recording.steps, cost=cost))
     labels = [recorded_label(recording), "chsel", "chsel@paper"]
     assert [(o.step, o.label) for o in outcomes] == [(k, name) for k in (0, 1) for name in labels]
     truth, sdf = recording.start.world_from_object, recording.start.sdf
@@ -93,7 +93,7 @@ def test_all_sets_are_judged_by_the_recorded_cost(path):
         inverse = np.linalg.inv(poses)
         errors = np.linalg.norm(inverse[:, :3, 3] - OFFSET, axis=1)
         assert outcome.numbers["best_position_error"] == pytest.approx(errors[best], abs=1e-12)
-        near = closest_pose(poses, truth, sdf)
+        near = closest_pose(poses, truth, sdf=sdf)
         assert outcome.numbers["closest_position_error"] == pytest.approx(errors[near], abs=1e-12)
         signs = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)])  # of a box
         traces = signs @ np.diagonal(inverse[best, :3, :3])
@@ -118,8 +118,8 @@ def test_errors_are_those_to_the_pose_that_a_push_has_left_the_object_in(path, t
     write_recording(tmp_path / "pushed.mcap", changed)
     recording = read_recording(tmp_path / "pushed.mcap")
     cost = common_cost(recording)
-    methods = chosen(recording, METHOD, ["chsel"])
-    for outcome in compared(recording, methods, recording.steps, cost):
+    methods = chosen(recording, METHOD, words=["chsel"])
+    for outcome in compared(recording, methods, steps=recording.steps, cost=cost):
         poses = outcome.hypotheses.object_from_world
         costs = CompiledCost.of(recording.problem(outcome.step), cost.settings).evaluate(poses)
         best = np.linalg.inv(poses[np.argmin(costs)])
@@ -132,7 +132,7 @@ def test_another_result_than_recorded_is_told(path, capsys, monkeypatch):
     registered = type(build_method("chsel")).register
 
     def later(self, problem, observer=None):
-        found = registered(self, problem, observer)
+        found = registered(self, problem, observer=observer)
         if problem.key.step != 1:
             return found
         return dataclasses.replace(found, cost=np.nextafter(found.cost, 1e9))
@@ -146,7 +146,7 @@ def test_changes_reach_the_methods_that_have_the_setting(path):
     recording = read_recording(path)
     labels = ["chsel", "chsel@paper", "chsel#two", "gradient_descent"]
     changes = ["emitter.iterations=20", "cost.known_scale=2", "chsel#two:archive.bins=7"]
-    found = {c.label: c for c in chosen(recording, METHOD, [*labels, *changes])}
+    found = {c.label: c for c in chosen(recording, METHOD, words=[*labels, *changes])}
     assert [c.changes for c in found.values()] == [
         ("emitter.iterations=20", "cost.known_scale=2"),
         ("emitter.iterations=20", "cost.known_scale=2"),
@@ -161,7 +161,7 @@ def test_changes_reach_the_methods_that_have_the_setting(path):
     assert settings["chsel@paper"].cost.lookup == "nearest"
     assert settings["gradient_descent"].descent.iterations == 50  # of the default preset
     assert not any(is_recorded(recording, c) for c in found.values())
-    (same,) = chosen(recording, METHOD, ["chsel", "emitter.iterations=12"])
+    (same,) = chosen(recording, METHOD, words=["chsel", "emitter.iterations=12"])
     assert is_recorded(recording, same)
 
 
@@ -179,7 +179,7 @@ def test_changes_reach_the_methods_that_have_the_setting(path):
 )
 def test_what_is_no_method_or_setting_is_named(path, words, message):
     with pytest.raises(SettingError, match=re.escape(message)):
-        chosen(read_recording(path), METHOD, words)
+        chosen(read_recording(path), METHOD, words=words)
 
 
 def test_everything_is_saved(path, tmp_path, capsys):
@@ -212,7 +212,7 @@ def test_a_method_that_fails_leaves_the_others_alone(path, tmp_path, capsys, mon
     def failing(self, problem, observer=None):
         if problem.key.step == 0:
             raise EngineError("no luck at step 0")
-        return registered(self, problem, observer)
+        return registered(self, problem, observer=observer)
 
     monkeypatch.setattr(type(build_method("gradient_descent")), "register", failing)
     out = tmp_path / "out.csv"
@@ -234,8 +234,8 @@ def test_a_recording_that_tells_no_method_is_judged_by_the_default_preset(events
     assert (cost.settings, cost.name) == (CostSettings(), "preset default")
     with pytest.raises(RecordingError, match="does not have the settings of a method"):
         recorded_method(recording)
-    methods = chosen(recording, METHOD, ["gradient_descent", "descent.iterations=2"])
-    found = list(compared(recording, methods, (2,), cost))
+    methods = chosen(recording, METHOD, words=["gradient_descent", "descent.iterations=2"])
+    found = list(compared(recording, methods, steps=(2,), cost=cost))
     assert [o.failure for o in found] == ["", ""]
     assert found[1].numbers["hypotheses"] == 5.0
 
@@ -243,8 +243,12 @@ def test_a_recording_that_tells_no_method_is_judged_by_the_default_preset(events
 def test_beside_plausible_sets_it_tells_how_far_hypotheses_are_from_them(tmp_path, capsys):
     path = Path(shutil.copy(REPLAYS / "cracker_box_chsel.mcap", tmp_path))
     recording = read_recording(path)
-    start, problem, found = recording.start, recording.problem(9), recording.hypotheses(9)
-    members = plausible_set(problem, start.world_from_object, plausible_settings("default", 0.001))
+    start = recording.start
+    problem = recording.problem(9)
+    found = recording.hypotheses(9)
+    members = plausible_set(
+        problem, start.world_from_object, settings=plausible_settings("default", 0.001)
+    )
     few = {name: getattr(members, name)[:30] for name in ("world_from_object", "cost", "local")}
     members = dataclasses.replace(members, **few)
     (tmp_path / "plausible").mkdir()
@@ -254,8 +258,10 @@ def test_beside_plausible_sets_it_tells_how_far_hypotheses_are_from_them(tmp_pat
     assert "each step, plausible sets by definition default" in capsys.readouterr().out
     rows = list(csv.DictReader((tmp_path / "out.csv").open()))
     (recorded,) = (row for row in rows if row["step"] == "9" and row["label"] != "icp")
-    points = surface_points(start.mesh, 500, StreamKey(start.seed, 0))
-    exact = SurfaceDistance(start.sdf, start.mesh, points, DistanceSettings(method="exact"))
+    points = surface_points(start.mesh, 500, key=StreamKey(start.seed, 0))
+    exact = SurfaceDistance(
+        start.sdf, start.mesh, points=points, settings=DistanceSettings(method="exact")
+    )
     expected = plausible_diversity(
         exact.between(found.object_from_world, members.world_from_object)
     )

@@ -30,7 +30,7 @@ def path(steered, write):
 
 
 def decided(events, step):
-    return nth(events, Decided, step + 1)
+    return nth(events, Decided, number=step + 1)
 
 
 def differing(path):
@@ -167,7 +167,7 @@ def test_a_decision_on_other_actions_is_exported_with_theirs(steered_events, wri
     )
     problem = dataclasses.replace(old.problem, actions=others, available=np.ones(count, dtype=bool))
     new = dataclasses.replace(old, problem=problem, decision=decision)
-    offered = ActionsOffered(1, others, nth(steered_events, ActionsOffered).hand)
+    offered = ActionsOffered(1, others, hand=nth(steered_events, ActionsOffered).hand)
     place = steered_events.index(old)
     later = [event for event in steered_events[place + 1 :] if not isinstance(event, Decided)]
     path = str(write([*steered_events[:place], offered, new, *later]))
@@ -189,9 +189,10 @@ def test_a_decision_on_other_actions_is_exported_with_theirs(steered_events, wri
 
 
 def test_others_decide_on_the_recorded_problem(path):
-    recording, others = read_recording(path), ("voxel_entropy", "nearest_mean", "grid")
-    choices = chosen(recording, POLICY, [*others, "stop.spread=0.0", "stop.gain=0.0"])
-    recorded, *rows = policy_decisions(recording, choices, [1])
+    recording = read_recording(path)
+    others = ("voxel_entropy", "nearest_mean", "grid")
+    choices = chosen(recording, POLICY, words=[*others, "stop.spread=0.0", "stop.gain=0.0"])
+    recorded, *rows = policy_decisions(recording, choices, steps=[1])
     assert recorded["label"] == "recorded: information"
     assert recorded["chosen"] == recording.decision(1).decision.chosen
     for name, row in zip(others, rows, strict=True):
@@ -218,7 +219,7 @@ def test_start_and_direction_are_the_hands_place_and_its_z_axis(steered):
         def decision(self, _):
             return dataclasses.replace(of_first, problem=problem)
 
-    (row,) = policy_decisions(Recorded(), [], [-1])
+    (row,) = policy_decisions(Recorded(), [], steps=[-1])
     pose = turned.world_from_hand[of_first.decision.chosen]
     forward, place = pose @ [0.0, 0.0, 1.0, 0.0], pose @ [0.0, 0.0, 0.0, 1.0]
     assert [row[name] for name in ("dx", "dy", "dz")] == pytest.approx(forward[:3], abs=1e-15)

@@ -13,15 +13,16 @@ from tests.replay.conftest import changed, nth
 
 
 def texts(first, second, *ignored):
-    return [str(item) for item in recording_diff(first, second, ignored).differences]
+    return [str(item) for item in recording_diff(first, second, ignored=ignored).differences]
 
 
 def test_a_bit_of_one_cost_is_found(events, write, capsys):
-    found = nth(events, HypothesesFound, 1)
+    found = nth(events, HypothesesFound, number=1)
     cost = found.hypotheses.cost.copy()
     cost[0] = np.nextafter(np.nextafter(cost[0], 9.0), 9.0)
     other = dataclasses.replace(found.hypotheses, cost=cost)
-    first, second = write(events), write(changed(events, found, hypotheses=other))
+    first = write(events)
+    second = write(changed(events, found, hypotheses=other))
     assert main(["diff", str(first), str(second)]) == 1
     lines = capsys.readouterr().out.split("\n")
     assert re.fullmatch(
@@ -39,7 +40,8 @@ def test_settings_and_environment_differ_by_key(events, write, capsys):
     config = {"object": {"name": "电钻", "scale": 2.5}, "flags": [True, None, -1.0], "new": {}}
     environment = {"torch": "2.14.0", "numpy": "2.4.6", "libigl": "2.6"}
     other = dataclasses.replace(events[0], config=config, environment=environment)
-    first, second = write(events), write([other, *events[1:]])
+    first = write(events)
+    second = write([other, *events[1:]])
     assert texts(first, second) == [
         "/session, start: config.object.scale: 1.5 -> 2.5",
         "/session, start: config.flags[2]: -1 -> -1.0",
@@ -59,7 +61,19 @@ def test_settings_and_environment_differ_by_key(events, write, capsys):
 
 def test_an_event_too_many_shifts_nothing(events, write):
     place = events.index(nth(events, Traced))
-    more = [*events[:place], Traced(1, "descent", 50, "1" * 32, 0.0, 1.0, 2.0), *events[place:]]
+    more = [
+        *events[:place],
+        Traced(
+            1,
+            "descent",
+            iteration=50,
+            digest="1" * 32,
+            lowest_cost=0.0,
+            median_cost=1.0,
+            highest_cost=2.0,
+        ),
+        *events[place:],
+    ]
     first, second = write(events), write(more)
     for pair, having in (((first, second), SECOND), ((second, first), FIRST)):
         expected = f"/trace, step 1, descent iteration 50: only in the {having} recording"

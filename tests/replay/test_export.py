@@ -73,7 +73,8 @@ def test_a_points_session_on_exported_points_has_the_recorded_problems(recording
     large: Any = SimpleNamespace(diameter=5.0)
     session = PointsSource(PointsSettings(str(path), workspace), large)
     assert session.workspace == recording.start.workspace
-    points, steps = KnownPoints(), []
+    points = KnownPoints()
+    steps = []
     for probe, original in zip(session.probes(), recording.probes, strict=True):
         points = points.merged(probe.new_points)
         steps.append(probe.step)
@@ -116,8 +117,17 @@ def test_hypotheses_are_the_recorded_ones(recording, events):
 
 def test_modes_are_those_of_the_recorded_beliefs(events, write):
     covariance = np.diag([1.0, 4.0, 4.0, 0.0, 0.0, 16.0])[None]
-    poses, centres = np.eye(4)[None], np.array([[0.1, 0.2, 0.3]])
-    told = Believed(2, np.array([7]), np.array([0.75]), poses, centres, covariance, 0.01)
+    poses = np.eye(4)[None]
+    centres = np.array([[0.1, 0.2, 0.3]])
+    told = Believed(
+        2,
+        np.array([7]),
+        weights=np.array([0.75]),
+        object_from_world=poses,
+        centres=centres,
+        covariances=covariance,
+        spread=0.01,
+    )
     found = next(e for e in events if isinstance(e, HypothesesFound) and e.step == 2)
     place = events.index(found) + 1
     recording = read_recording(write([*events[:place], told, *events[place:]]))
@@ -144,14 +154,23 @@ def test_a_mode_keeps_its_number_where_it_is_second_at_one_step_and_first_at_the
     """No contact has shown the knob of a box; turned by pi about its axis it fits as well."""
     body, contacts = box_with_knob([0.1, 0.06, 0.08])
     start = replace(registered_session("gradient_descent")[0], mesh=body, sdf=object_grid(body))
-    first, second = np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])
-    points, around = KnownPoints(known=contacts), (start.workspace, start.free_resolution)
-    events, known = [replace(start, initial_points=KnownPoints())], [points, KnownPoints()]
+    first = np.eye(4)
+    second = np.diag([-1.0, -1.0, 1.0, 1.0])
+    points = KnownPoints(known=contacts)
+    events = [replace(start, initial_points=KnownPoints())]
+    known = [points, KnownPoints()]
     for step, poses in enumerate(([first, second], [second, first])):
         key = StreamKey(start.seed, step)
-        problem = RegistrationProblem(start.sdf, points, np.stack(poses), *around, key)
+        problem = RegistrationProblem(
+            sdf=start.sdf,
+            points=points,
+            initial_set=np.stack(poses),
+            workspace=start.workspace,
+            free_resolution=start.free_resolution,
+            key=key,
+        )
         found = hypotheses_at(np.stack(poses))
-        events += [Probe(step, "points", known[step]), ProblemPosed(step, problem)]
+        events += [Probe(step, "points", new_points=known[step]), ProblemPosed(step, problem)]
         events.append(HypothesesFound(step, found))
     modes = exported_modes(read_recording(write(events)), None).table
     assert modes["number"].tolist() == [0, 1, 1, 0]

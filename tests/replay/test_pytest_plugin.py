@@ -58,7 +58,7 @@ def test_folders_of_the_configuration_alone_are_collected(pytester, stored):
 
 
 def test_a_failing_item_says_what_verify_says(pytester, steered, write, tmp_path):
-    old = nth(steered, Decided, 2)
+    old = nth(steered, Decided, number=2)
     decision = dataclasses.replace(old.decision, score=old.decision.score * 2.0)
     folder = tmp_path / "kept"
     folder.mkdir()

@@ -46,7 +46,8 @@ class Gate:
 
 
 def test_files_and_pictures_get_everything_in_order_at_a_flush():
-    file, pictures = Gate(), Gate(is_open=False)
+    file = Gate()
+    pictures = Gate(is_open=False)
     recorder = Recorders([file], pictures)
     recorder.record(1)
     recorder.record(2)
@@ -64,7 +65,8 @@ def test_files_and_pictures_get_everything_in_order_at_a_flush():
 
 @pytest.mark.parametrize("end", ["flush", "close"])
 def test_what_follows_an_event_that_fails_is_dropped(end):
-    file, other = Gate("bad"), Gate()
+    file = Gate("bad")
+    other = Gate()
     recorder = Recorders([file, other])
     for event in ("good", "bad", "dropped"):
         recorder.record(event)
@@ -76,7 +78,8 @@ def test_what_follows_an_event_that_fails_is_dropped(end):
 
 @pytest.mark.parametrize("optional", ["", "it can be made anew"])
 def test_an_error_of_pictures_is_raised_or_a_warning_and_files_are_closed(optional, recwarn):
-    file, pictures = Gate(), Gate("bad", is_open=False)
+    file = Gate()
+    pictures = Gate("bad", is_open=False)
     recorder = Recorders([file], pictures, optional=optional)
     for event in ("good", "bad", "dropped"):
         recorder.record(event)
@@ -123,14 +126,16 @@ def test_all_that_was_flushed_survives_sigkill(tmp_path, events, assert_same):
 
 
 def test_a_recording_is_on_the_disk_when_it_is_closed(events, tmp_path, monkeypatch):
-    recorder, synced = McapRecorder(tmp_path / "a.mcap"), []
+    recorder = McapRecorder(tmp_path / "a.mcap")
+    synced = []
     monkeypatch.setattr(os, "fsync", lambda number: synced.append(os.fstat(number)))
     recorder.record(events[0])
     recorder.flush()
     assert synced == []  # a step waits for no disk
     recorder.close()
     last = {each.st_ino: each.st_size for each in synced}
-    file, folder = (tmp_path / "a.mcap").stat(), tmp_path.stat()
+    file = (tmp_path / "a.mcap").stat()
+    folder = tmp_path.stat()
     assert (last[file.st_ino], folder.st_ino in last) == (file.st_size, True)
 
 

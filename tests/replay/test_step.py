@@ -74,7 +74,7 @@ def test_another_method_with_other_settings_is_recorded_as_such(recording, step,
     assert config["method"]["descent"]["stop_below"] is None
     assert config["preset"] == {"name": "paper"}
     assert again.problem(1).digest == recording.problem(1).digest
-    (choice,) = chosen(recording, METHOD, ["gradient_descent@paper", "cost.free_scale=40"])
+    (choice,) = chosen(recording, METHOD, words=["gradient_descent@paper", "cost.free_scale=40"])
     expected = choice.build().register(recording.problem(1))
     assert again.hypotheses(1).digest == expected.digest != recording.hypotheses(1).digest
 

@@ -29,7 +29,7 @@ ARGUMENTS = {
 assert set(ARGUMENTS) == set(VERBS)
 
 
-def verb_arguments(verb, file, out, *, step=8, other=None):
+def verb_arguments(verb, file, *, out, step=8, other=None):
     """The verb and its arguments. out: name of what is written, without its suffix."""
     names = {"FILE": str(file), "OTHER": str(other or file), "STEP": str(step)}
     words = (names.get(word, word) for word in ARGUMENTS[verb])
@@ -66,8 +66,9 @@ def test_a_verb_takes_files_of_any_name_and_overwrites_none(verb, tmp_path, caps
     path = tmp_path / HOSTILE
     path.parent.mkdir()
     shutil.copy(REPLAY, path)
-    before, step = path.read_bytes(), read_recording(path).steps[0]
-    words = verb_arguments(verb, path, path.with_suffix(".out"), step=step)
+    before = path.read_bytes()
+    step = read_recording(path).steps[0]
+    words = verb_arguments(verb, path, out=path.with_suffix(".out"), step=step)
     assert main(words) == 0
     printed = capsys.readouterr()
     assert not set(printed.out + printed.err) & set("\x1b\x07\x9b\u202e")
@@ -84,7 +85,7 @@ def test_a_verb_takes_files_of_any_name_and_overwrites_none(verb, tmp_path, caps
         assert out.read_bytes() == b"mine"
     assert path.read_bytes() == before
     nowhere = tmp_path / "nowhere" / HOSTILE
-    assert main(verb_arguments(verb, nowhere, tmp_path / "out")) == 2
+    assert main(verb_arguments(verb, nowhere, out=tmp_path / "out")) == 2
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err.startswith("error: ")

@@ -29,9 +29,9 @@ def descent():
     return registered_session("gradient_descent")
 
 
-def measured(events, step, change):
+def measured(events, step, *, change):
     """The events with other measured values of a step."""
-    old = nth(events, Measured, step)
+    old = nth(events, Measured, number=step)
     return changed(events, old, values={name: change(name, x) for name, x in old.values.items()})
 
 
@@ -48,7 +48,7 @@ def test_equal_bits_are_status_0(capsys):
 
 
 def test_one_cost_that_is_one_ulp_larger_is_found(descent, write, capsys):
-    old = nth(descent, HypothesesFound, 1)
+    old = nth(descent, HypothesesFound, number=1)
     cost = old.hypotheses.cost.copy()
     cost[2] = np.nextafter(cost[2], 0.0)
     path = write(changed(descent, old, hypotheses=dataclasses.replace(old.hypotheses, cost=cost)))
@@ -92,7 +92,7 @@ def test_a_changed_trace_names_its_iteration(write):
 def test_wrong_numbers_are_named(descent, write, capsys):
     """Errors to the true pose, and how far a result is trusted, are computed again."""
     halved = ("best_position_error", "closest_position_error", "modes", "verdict")
-    path = write(measured(descent, 1, lambda n, x: x / 2 + 0.1 if n in halved else x))
+    path = write(measured(descent, 1, change=lambda n, x: x / 2 + 0.1 if n in halved else x))
     found = verdicts(path)
     assert [verdict.outcome for verdict in found] == [EQUAL, DIFFERS]
     assert found[1].stage == "the measured values"
@@ -107,12 +107,12 @@ def test_wrong_numbers_are_named(descent, write, capsys):
 
 def test_numbers_may_differ_as_libraries_round_and_no_more(descent, write):
     for factor, outcome in ((1 + 1e-13, EQUAL), (1 + 1e-7, DIFFERS)):
-        path = write(measured(descent, 0, lambda _, x, by=factor: x * by))
+        path = write(measured(descent, 0, change=lambda _, x, by=factor: x * by))
         assert next(verify(read_recording(path))).outcome == outcome
-    assert is_close(0.01, 0.01 + 0.9e-4, "best_position_error")
-    assert not is_close(0.01, 0.01 + 1.1e-4, "best_position_error")
-    assert not is_close(0.01, 0.01 + 1e-6, "archive_coverage")
-    assert not is_close(0.01, None, "best_position_error")
+    assert is_close(0.01, 0.01 + 0.9e-4, name="best_position_error")
+    assert not is_close(0.01, 0.01 + 1.1e-4, name="best_position_error")
+    assert not is_close(0.01, 0.01 + 1e-6, name="archive_coverage")
+    assert not is_close(0.01, None, name="best_position_error")
 
 
 def test_a_registration_that_was_interrupted_has_nothing_to_compare(descent, write, capsys):
@@ -204,7 +204,8 @@ def test_several_files_and_processes_give_the_same_verdicts(tmp_path, capsys):
         shutil.copy(path, folder)
     (folder / "broken.mcap").write_bytes(DESCENT.read_bytes()[:5000])
     paths = sorted(folder.iterdir())
-    alone, together = list(verified_files(paths)), list(verified_files(paths, jobs=2))
+    alone = list(verified_files(paths))
+    together = list(verified_files(paths, jobs=2))
     for file in (*alone, *together):
         file.seconds = 0.0
     assert alone == together

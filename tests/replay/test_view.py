@@ -43,7 +43,8 @@ def test_what_is_saved_is_what_a_session_draws(sensor_events, tmp_path, write, c
 
 
 def test_nothing_after_the_step_asked_for_is_saved(events, tmp_path, write, capsys):
-    file, saved = str(write(events)), tmp_path / "saved.rrd"
+    file = str(write(events))
+    saved = tmp_path / "saved.rrd"
     assert main(["view", file, "--save", str(saved), "--step", "7"]) == 2
     assert "there is no step 7; accepted: 0, 1, 2" in capsys.readouterr().err
     assert not saved.exists()

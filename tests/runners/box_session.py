@@ -13,7 +13,7 @@ BOX = trimesh.creation.box((0.1, 0.06, 0.2))
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
 
 
-def points_session(folder, probes=6, contacts=5, **more):
+def points_session(folder, probes=6, *, contacts=5, **more):
     """Write a file of points and a mesh to `folder`; the overrides of runners.probe for them.
 
     contacts: new ones in each probe. more: arrays of the file; None leaves one out.

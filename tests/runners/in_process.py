@@ -27,7 +27,9 @@ def run(program, *arguments, columns=160):
 
     Hydra would compose its configuration twice, first to see whether it has a hydra.mode.
     """
-    out, errors, status = io.StringIO(), io.StringIO(), 0
+    out = io.StringIO()
+    errors = io.StringIO()
+    status = 0
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(errors):
         patch.setattr(sys, "argv", ["program", *arguments])
         patch.setattr(Hydra, "get_mode", lambda *_, **__: None)
@@ -38,7 +40,7 @@ def run(program, *arguments, columns=160):
             program()
         except SystemExit as end:
             status = int(end.code or 0)
-    return Done(status, out.getvalue(), errors.getvalue())
+    return Done(status, out.getvalue(), stderr=errors.getvalue())
 
 
 def do_task(plan, task):

@@ -22,13 +22,13 @@ DEFINITION = {
 }
 
 
-def row(configuration, seed, method, step, **numbers):
+def row(configuration, seed, *, method, step, **numbers):
     """A registration that has gone well; numbers: by the names of the columns."""
     found = {"object": configuration.split("_")[0], "configuration": configuration, "seed": seed}
     return {**found, "method": method, "preset": "default", "step": step, "status": "ok", **numbers}
 
 
-def write_evaluation(folder, rows, iterations=None, **experiment):
+def write_evaluation(folder, rows, *, iterations=None, **experiment):
     """A folder with these tables; None: without the table."""
     folder.mkdir(parents=True, exist_ok=True)
     described = {
@@ -48,11 +48,11 @@ def write_evaluation(folder, rows, iterations=None, **experiment):
     (folder / "experiment.json").write_text(json.dumps(described))
     for name, some, schema in (("results", rows, RESULTS), ("iterations", iterations, ITERATIONS)):
         if some is not None:
-            write_table(folder / f"{name}.parquet", some, schema)
+            write_table(folder / f"{name}.parquet", some, schema=schema)
     return folder
 
 
-def write_table(path, rows, schema=RESULTS):
+def write_table(path, rows, *, schema=RESULTS):
     """Rows as a table; what they do not have is null."""
     pa.parquet.write_table(pa.Table.from_pylist(list(rows), schema=schema), path)
 
@@ -69,7 +69,7 @@ def tables_of(folder, baseline=None):
     }
 
 
-def session(configuration, seed, policy, errors, **columns):
+def session(configuration, seed, *, policy, errors, **columns):
     """A row per probe. errors: millimetres. columns: further ones, a value for each probe."""
     about = {"object": configuration.split("_")[0], "configuration": configuration, "seed": seed}
     about |= {"policy": policy, "method": "anchored", "preset": "default", "faults": "clean"}
@@ -90,7 +90,7 @@ def session(configuration, seed, policy, errors, **columns):
     ]
 
 
-def write_sessions(folder, rows, budgets):
+def write_sessions(folder, rows, *, budgets):
     """A folder with these rows. budgets: probes of a session, by policy."""
     policies = {
         name: {"name": name, "settings": {"probes": probes}} for name, probes in budgets.items()
@@ -105,5 +105,5 @@ def write_sessions(folder, rows, budgets):
         configurations=trials["configuration"],
         seeds=trials["seed"],
     )
-    write_table(folder / "probes.parquet", rows, PROBES)
+    write_table(folder / "probes.parquet", rows, schema=PROBES)
     return folder

@@ -110,7 +110,9 @@ def test_a_raw_log_is_read_first_and_its_object_is_named(tmp_path):
     )
     model = load_model("mustard")
     mesh = clean_mesh(model.vertices, model.faces, name="mustard", scale=1.0)
-    made = simulate_log(log, CABINET_CONFIGURATIONS["cabinet_mustard"], mesh, 0, small)
+    made = simulate_log(
+        log, CABINET_CONFIGURATIONS["cabinet_mustard"], mesh=mesh, seed=0, settings=small
+    )
     x, y, z = (float(value) for value in made.world_from_object[:3, 3] + [0.01, 0.0, 0.005])
     yaw = float(np.arctan2(made.world_from_object[1, 0], made.world_from_object[0, 0]))
     guess = (f"position=[{x},{y},{z}]", f"rotation=[0,0,{yaw}]")

@@ -139,8 +139,10 @@ class CachedSDF:
 
 
 def test_free_points_are_a_lattice_around_the_object_and_contacts_touch_it():
-    posed, (mesh, _) = pose(PROBLEMS["real_20"], seed=0), drill(1.0)
-    points, object_from_world = posed.points, inverse(standing(mesh))
+    posed = pose(PROBLEMS["real_20"], seed=0)
+    (mesh, _) = drill(1.0)
+    points = posed.points
+    object_from_world = inverse(standing(mesh))
     assert mesh_sdf(mesh, apply(object_from_world, points.free))[0].min() > 0.0
     assert np.abs(mesh_sdf(mesh, apply(object_from_world, points.contacts))[0]).max() < 1e-6
     assert (len(points.free), len(points.contacts)) == (pytest.approx(20_000, rel=0.05), 20)
@@ -151,7 +153,8 @@ def test_free_points_are_a_lattice_around_the_object_and_contacts_touch_it():
 
 
 def test_the_package_reads_the_nodes_of_our_grid(problem):
-    grid, bounds = problem.sdf, np.array([[-0.1, -0.2, -0.3], [0.4, 0.5, 0.6]])
+    grid = problem.sdf
+    bounds = np.array([[-0.1, -0.2, -0.3], [0.4, 0.5, 0.6]])
     values = {"sdf_values": grid.values, "sdf_gradients": grid.gradients, "object_bounds": bounds}
     sdf = GridSdf({**values, "sdf_origin": grid.origin, "sdf_resolution": grid.resolution})
     nodes = np.array([[0, 0, 0], [3, 5, 7], np.array(grid.shape) - 1])
@@ -176,13 +179,13 @@ def test_measurements_alternate_and_rows_tell_their_middle():
     assert order == ["a", "b", "a", "b"]
     assert samples == {"a": (1.0, 3.0), "b": (102.0, 104.0)}
     assert in_turn(2, measured) == {"a": (7.0, 9.0), "b": (108.0, 110.0)}
-    row = Row("measure", "case", "who", "ms", (4.0, 1.0, 2.0, 3.0, 10.0))
+    row = Row("measure", "case", who="who", unit="ms", samples=(4.0, 1.0, 2.0, 3.0, 10.0))
     assert (row.median, row.quartiles) == (3.0, (2.0, 4.0))
 
 
 def test_ratios_are_of_the_same_problem():
     ours, package, other = (
-        Row("registration", case, who, "ms", (taken,))
+        Row("registration", case, who=who, unit="ms", samples=(taken,))
         for case, who, taken in (
             ("x", "ours, paper", 2.0),
             ("x", "package", 30.0),
@@ -190,8 +193,10 @@ def test_ratios_are_of_the_same_problem():
         )
     )
     rows = [ours, package, other]
-    assert slower(rows, ours, "package") == 15.0
-    assert slower(rows, package, "package") is slower(rows, other, "package") is None
+    assert slower(rows, ours, package="package") == 15.0
+    assert (
+        slower(rows, package, package="package") is slower(rows, other, package="package") is None
+    )
 
 
 def test_the_worker_does_all_steps_of_the_package_and_counts_them(stand_in, problem):

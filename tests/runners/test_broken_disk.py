@@ -67,7 +67,8 @@ def test_a_full_disk_is_one_error_and_every_reported_probe_stays(session, tmp_pa
 
 
 def test_every_reported_probe_of_a_killed_run_is_recovered(session, tmp_path):
-    process, output = start(tmp_path, *session, "recording=mcap"), ""
+    process = start(tmp_path, *session, "recording=mcap")
+    output = ""
     for line in process.stdout:
         output += line
         if reported_probes(output) == 2:

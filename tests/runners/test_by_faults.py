@@ -30,12 +30,15 @@ def test_configurations_and_levels_of_faults_have_names():
         "mixed",
         "box_fallen",
     )
-    assert chosen_names("faults", ["noise_*", "clean"], LEVELS)[:2] == ("clean", "noise_1mm")
+    assert chosen_names("faults", ["noise_*", "clean"], existing=LEVELS)[:2] == (
+        "clean",
+        "noise_1mm",
+    )
 
 
 def test_without_plausible_sets_there_is_no_pd_but_the_distance_from_the_truth(tmp_path):
     plan = plan_in(tmp_path / "out", steps="5", plausible=False)
-    join_experiment(plan, "test", [FAULTY.configuration], [0])
+    join_experiment(plan, "test", configurations=[FAULTY.configuration], seeds=[0])
     for task in (Task(FAULTY), Task(FAULTY, "icp")):
         assert do_task(plan, task) == ""
     (found,) = collect(plan.folder).to_pylist()
@@ -44,7 +47,9 @@ def test_without_plausible_sets_there_is_no_pd_but_the_distance_from_the_truth(t
     assert found["truth_held"] is None  # ICP has no set
     assert not TRIAL.folder(plan).exists()
     with pytest.raises(SettingError, match="plausible is True, was False"):
-        join_experiment(plan_in(tmp_path / "out", steps="5"), "test", ["mustard"], [0])
+        join_experiment(
+            plan_in(tmp_path / "out", steps="5"), "test", configurations=["mustard"], seeds=[0]
+        )
 
 
 @pytest.mark.parametrize(
@@ -64,7 +69,7 @@ def test_faults_that_cannot_be_evaluated_are_one_line(tmp_path, arguments, messa
 def test_the_interval_of_a_share_is_wilsons():
     flags = {"most": [True] * 9 + [False, None], "none": [False] * 5, "all": [True] * 5}
     rows = [{"of": of, "held": held} for of, some in flags.items() for held in some]
-    found = shares(pd.DataFrame(rows), "of", "held")
+    found = shares(pd.DataFrame(rows), "of", column="held")
     assert found.loc["most", ["lower", "upper"]].tolist() == pytest.approx(
         [0.5958, 0.9821], abs=1e-4
     )
@@ -82,7 +87,10 @@ def made_up(tmp_path):
         for step in range(4):
             numbers = {"diversity": 10.0 + step, "faults": level, "position_error": 0.002}
             own = {**numbers, "truth_held": step < count, "nearest_hypothesis": 0.001 * step}
-            rows += [row(name, 0, "own", step, **own), row(name, 0, "icp", step, **numbers)]
+            rows += [
+                row(name, 0, method="own", step=step, **own),
+                row(name, 0, method="icp", step=step, **numbers),
+            ]
     return write_evaluation(tmp_path / "evaluation", rows)
 
 
@@ -102,6 +110,6 @@ def test_tables_have_a_line_a_level_and_one_of_all(made_up):
 
 
 def test_evaluations_without_faults_have_no_such_section(tmp_path):
-    folder = write_evaluation(tmp_path, [row("can", 0, "icp", 4, diversity=1.0)])
+    folder = write_evaluation(tmp_path, [row("can", 0, method="icp", step=4, diversity=1.0)])
     evaluation = open_evaluation(folder)
     assert tables_by_faults(evaluation.rows, styles_of(evaluation.methods)) == []

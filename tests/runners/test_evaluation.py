@@ -57,7 +57,7 @@ def plan_in(folder, methods=("icp",), **changes):
         every=None,
         recordings=True,
         assets=folder,
-        contenders=chosen_contenders(list(methods), FAST, "default"),
+        contenders=chosen_contenders(list(methods), FAST, preset="default"),
         outside={},
     )
     return replace(plan, **changes)
@@ -77,7 +77,7 @@ def make_plan(session, tmp_path):
 
     def make(methods=("icp",), **changes):
         plan = plan_in(tmp_path / "out", methods, **changes)
-        join_experiment(plan, "test", [TRIAL.configuration], [TRIAL.seed])
+        join_experiment(plan, "test", configurations=[TRIAL.configuration], seeds=[TRIAL.seed])
         there = TRIAL.folder(plan)
         (there / "plausible").mkdir(parents=True)
         for path in [*session.glob("session.*"), *session.glob("plausible/*")]:
@@ -100,9 +100,11 @@ def test_configurations_and_seeds_are_named_alone_by_patterns_by_object_or_in_li
         "cracker_box": "box box_fallen",
         "clamp*,can": "can clamp clamp_sideways",
     }.items():
-        assert chosen_names("configurations", value, existing, existing) == tuple(names.split())
-    assert chosen_names("configurations", ["can", "box"], existing) == ("box", "can")
-    assert len(chosen_names("configurations", "all", existing)) == 17
+        assert chosen_names("configurations", value, existing=existing, objects=existing) == tuple(
+            names.split()
+        )
+    assert chosen_names("configurations", ["can", "box"], existing=existing) == ("box", "can")
+    assert len(chosen_names("configurations", "all", existing=existing)) == 17
     assert chosen_seeds(3) == (3,)
     assert chosen_seeds([1, 0, 1]) == (0, 1)
     assert chosen_seeds("7,0..1") == (0, 1, 7)
@@ -115,15 +117,19 @@ def test_a_contender_has_its_preset_and_changes_by_method_label_and_entry():
         {"name": "chsel", "label": "small", "settings": {"archive": {"bins": 8}}},
     ]
     settings = {"chsel": {"passes": 2}, "chsel@paper#bins": {"archive": {"bins": 9}}}
-    plain, marked, small = chosen_contenders(entries, settings, "default").values()
+    plain, marked, small = chosen_contenders(entries, settings, preset="default").values()
     assert [one.label for one in (plain, marked, small)] == ["chsel", "chsel@paper#bins", "small"]
     assert [one.settings["archive"]["bins"] for one in (plain, marked, small)] == [56, 9, 8]
     assert [one.settings["passes"] for one in (plain, marked, small)] == [2, 2, 2]
     assert [one.preset for one in (plain, marked, small)] == ["default", "paper", "default"]
     assert marked.settings["cost"]["lookup"] == "nearest"
-    assert list(chosen_contenders("icp", {}, "default", draws=3)) == ["icp", "icp+1", "icp+2"]
+    assert list(chosen_contenders("icp", {}, preset="default", draws=3)) == [
+        "icp",
+        "icp+1",
+        "icp+2",
+    ]
     with pytest.raises(SettingError, match=r"methods has icp\+1 twice"):
-        chosen_contenders(["icp", {"name": "icp", "label": "icp+1"}], {}, "default", draws=2)
+        chosen_contenders(["icp", {"name": "icp", "label": "icp+1"}], {}, preset="default", draws=2)
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +142,10 @@ def cluster():
 def finished(plan, cluster):
     """Do all tasks of the trial that are not done; why each failed, by its label."""
     missing = [task for task in tasks_of(plan, [TRIAL]) if not is_finished(plan, task)]
-    return {task.label: failure for task, failure in do_tasks(plan, missing, *cluster)}
+    return {
+        task.label: failure
+        for task, failure in do_tasks(plan, missing, client=cluster[0], workers=cluster[1])
+    }
 
 
 def _dies(plan, task):
@@ -197,7 +206,7 @@ def test_a_registration_that_fails_is_a_row_and_the_session_goes_on(make_plan, m
 
 def test_a_session_that_fails_fails_its_methods_and_no_others(tmp_path, cluster):
     plan = plan_in(tmp_path, objects="scans", assets=tmp_path / "nowhere")
-    join_experiment(plan, "test", [TRIAL.configuration], [TRIAL.seed])
+    join_experiment(plan, "test", configurations=[TRIAL.configuration], seeds=[TRIAL.seed])
     ended = finished(plan, cluster)
     assert ended["icp"] == f"session: {ended['']}" != "session: "
     (row,) = results(plan)
@@ -245,7 +254,7 @@ def test_sets_from_outside_rank_as_methods_do(make_plan, tmp_path):
 
 def step_of(plan, points_digest):
     """The step whose known points have a digest."""
-    found = problems(plan, TRIAL, open_recorded(plan, TRIAL))
+    found = problems(plan, TRIAL, session=open_recorded(plan, TRIAL))
     return next(one.key.step for one in found if one.points.digest == points_digest)
 
 
@@ -266,7 +275,7 @@ def test_a_set_from_outside_that_is_wrong_is_told(tmp_path):
     ):
         np.savez(tmp_path / "mustard" / "seed_0.npz", **values)
         with pytest.raises(ChselError, match=message):
-            read_external(plan, TRIAL, "mine")
+            read_external(plan, TRIAL, label="mine")
 
 
 def test_searches_are_measured_from_the_same_starts(make_plan):
@@ -295,8 +304,9 @@ def test_searches_are_measured_from_the_same_starts(make_plan):
 def test_a_session_with_faults_is_measured_by_the_plausible_sets_of_that_without(
     make_plan, monkeypatch
 ):
-    plan, faulty = make_plan(steps="5"), Trial(0, "mustard+noise_3mm")
-    join_experiment(plan, "test", [faulty.configuration], [0])
+    plan = make_plan(steps="5")
+    faulty = Trial(0, "mustard+noise_3mm")
+    join_experiment(plan, "test", configurations=[faulty.configuration], seeds=[0])
     asked: list[FloatArray] = []
 
     def holds(self, problem, found, poses):
@@ -315,20 +325,24 @@ def test_a_session_with_faults_is_measured_by_the_plausible_sets_of_that_without
     assert clean["truth_held"] is noisy["truth_held"] is True
 
     recording = read_recording(faulty.folder(plan) / "icp.mcap")
-    start, truth = recording.start, recording.start.world_from_object
+    start = recording.start
+    truth = recording.start.world_from_object
     assert start.config["session"]["faults"]["contact_noise"] == 0.003
     without = read_recording(TRIAL.folder(plan) / "session.mcap").start
     np.testing.assert_array_equal(truth, without.world_from_object)
     np.testing.assert_allclose(asked[0][0] @ truth, np.eye(4), atol=1e-12)
-    found, symmetry = recording.hypotheses(5).object_from_world, object_symmetry(start.mesh)
-    position, rotation = pose_errors(found, truth, symmetry)
+    found = recording.hypotheses(5).object_from_world
+    symmetry = object_symmetry(start.mesh)
+    position, rotation = pose_errors(found, truth, symmetry=symmetry)
     nearest = int(np.argmin(np.abs(position - noisy["nearest_position"])))
     assert rotation[nearest] == pytest.approx(noisy["nearest_rotation"])
     assert 0.0 < noisy["nearest_hypothesis"] < 0.1
 
-    rows = ResultRows(plan, faulty, open_recorded(plan, faulty), "icp")
+    rows = ResultRows(plan, faulty, session=open_recorded(plan, faulty), label="icp")
     true = inverse(truth[None])
-    exact = Hypotheses(true, np.zeros(1), np.zeros(1, dtype=bool), np.full(1, -1), true)
+    exact = Hypotheses(
+        true, np.zeros(1), duplicate=np.zeros(1, dtype=bool), cell=np.full(1, -1), elites=true
+    )
     assert (
         rows.row(recording.problem(5), exact)["exact_members"] == 1.0
     )  # by contacts without noise

@@ -34,7 +34,8 @@ def recording(tmp_path_factory):
 
 def test_contacts_are_where_the_object_is_and_then_it_moves_along_the_push(recording):
     mesh, pose = recording.start.mesh, recording.start.world_from_object
-    centre, turns = centre_of_mass(mesh)[None], []
+    centre = centre_of_mass(mesh)[None]
+    turns = []
     for each in recording.probes:
         assert (
             np.abs(mesh_sdf(mesh, apply(inverse(pose), each.contacts))[0]).max(initial=0.0) < 1e-5
@@ -58,7 +59,7 @@ def test_errors_are_those_to_the_pose_at_their_step(recording):
     for event in measured:
         found = recording.hypotheses(event.step).object_from_world[:1]
         truth = recording.start_at(event.step).world_from_object
-        errors = pose_errors(found, truth, symmetry)
+        errors = pose_errors(found, truth, symmetry=symmetry)
         assert event.values["best_position_error"] == pytest.approx(errors[0][0], abs=1e-12)
     assert len(measured) >= 3
 
@@ -93,7 +94,7 @@ def test_recorded_problems_with_pushes_give_the_recorded_bits(recording):
 def test_a_push_is_horizontal_along_the_z_axis_of_a_hand_that_touches(way, outcome, push):
     path = np.eye(4)[None].repeat(2, axis=0)
     path[1, :3, 2] = way  # the other axes do not matter
-    found = Probe(0, outcome, KnownPoints(), path).push
+    found = Probe(0, outcome, new_points=KnownPoints(), gripper_path=path).push
     assert (found is None) == (push is None)
     if push is not None:
         np.testing.assert_allclose(found, push)

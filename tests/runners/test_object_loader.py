@@ -31,7 +31,7 @@ def chosen(*overrides):
     """The object that a command line with these overrides chooses."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = plain(compose("fetch", overrides=list(overrides)))
-    return build_settings(ObjectConfig, config["object"], "object")
+    return build_settings(ObjectConfig, config["object"], where="object")
 
 
 def test_models_and_scans_share_the_scales_of_the_trials():
@@ -135,7 +135,13 @@ def test_a_missing_file_tells_what_to_do(overrides, message, tmp_path):
     [(0.04, 1.0, 0), (0.04, 0.001, 0), (0.49, 1.0, 0), (0.04, 2.5, 1), (0.51, 1.0, 1)],
 )
 def test_enlarged_objects_and_those_longer_than_the_workspace_are_a_warning(length, scale, count):
-    model = ObjectModel("box", trimesh.creation.box((length, 0.02, 0.03)), scale, 0.001, "drill")
+    model = ObjectModel(
+        "box",
+        trimesh.creation.box((length, 0.02, 0.03)),
+        scale=scale,
+        epsilon=0.001,
+        configuration="drill",
+    )
     found = check_size(model, Workspace((0.0, 0.0, 0.0), (0.4, 0.5, 0.3)))
     text = (
         f"the object is {length} m long at scale {scale:g}, the workspace 0.5 m; objects of "

@@ -59,8 +59,10 @@ def test_a_recording_gets_its_sets_and_its_hypotheses_are_measured(folder):
     assert settings.grid.rotations == 200
     for step in recording.steps:
         problem = recording.problem(step)
-        stored = load_plausible(folder / "plausible", problem, settings, world_from_object=POSE)
-        assert stored.digest == plausible_set(problem, POSE, settings).digest
+        stored = load_plausible(
+            folder / "plausible", problem, settings=settings, world_from_object=POSE
+        )
+        assert stored.digest == plausible_set(problem, POSE, settings=settings).digest
         assert stored.local.any()
         cells = rows(done.stdout)[step]
         assert float(cells[9]) == pytest.approx(float(cells[7]) + float(cells[8]), rel=0.01)
@@ -89,7 +91,7 @@ def test_a_points_file_needs_its_object_and_the_true_pose_in_it_or_beside_it(fol
     assert unknown.returncode == 2
     assert "has no true pose" in unknown.stderr
     assert "python -m runners.align" in unknown.stderr
-    write_pose(beside(folder / "unknown.npz"), POSE, {})  # as runners.align does
+    write_pose(beside(folder / "unknown.npz"), POSE, about={})  # as runners.align does
     found = run(plausible.main, str(folder / "unknown.npz"), *thing)
     assert (found.returncode, found.stderr) == (0, "")
     sets = [read_plausible(file) for file in (folder / "sets").iterdir() if file != path]
@@ -131,7 +133,12 @@ def test_wide_definitions_add_up_contacts_or_take_their_mean(name, expected):
     )
     points = KnownPoints(known=1.05 * contacts)
     problem = RegistrationProblem(
-        ball(0.1, 0.005), points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(0, 0)
+        sdf=ball(0.1, 0.005),
+        points=points,
+        initial_set=np.eye(4)[None],
+        workspace=WORKSPACE,
+        free_resolution=0.03,
+        key=StreamKey(0, 0),
     )
     settings = plausible_settings(name, 0.001)
     cost = EvaluationCost(problem, settings.cost).evaluate(np.eye(4)[None])[0]

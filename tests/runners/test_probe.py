@@ -72,8 +72,10 @@ def test_recorded_errors_are_modulo_symmetries(finished):
     for event in measured:
         found, problem = recording.hypotheses(event.step), recording.problem(event.step)
         truth = recording.start.world_from_object
-        trust = trust_by(recorded_method(recording).build(), problem, found)
-        expected = result_numbers(found, problem, truth, symmetry, trust)
+        trust = trust_by(recorded_method(recording).build(), problem, hypotheses=found)
+        expected = result_numbers(
+            found, problem, world_from_object=truth, symmetry=symmetry, trust=trust
+        )
         assert event.values == pytest.approx(expected, abs=1e-6)
 
 
@@ -81,7 +83,9 @@ def test_trust_is_on_the_terminal_in_the_summary_and_in_the_log(finished):
     folder, done = finished
     recording = read_recording(folder / "recording.mcap")
     method = recorded_method(recording).build()
-    trusts = [trust_by(method, recording.problem(n), recording.hypotheses(n)) for n in range(3)]
+    trusts = [
+        trust_by(method, recording.problem(n), hypotheses=recording.hypotheses(n)) for n in range(3)
+    ]
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["trust"] == json.loads(json.dumps(asdict(trusts[2])))
     assert [step["verdict"] for step in summary["steps"]] == [trust.verdict for trust in trusts]

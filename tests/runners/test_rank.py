@@ -11,10 +11,14 @@ from tests.runners.made_up_evaluations import row, write_evaluation
 
 def test_an_entry_is_compared_to_the_bit_and_put_beside_the_others(tmp_path):
     pd = {"package": (100.0, 200.0), "icp": (50.0, 50.0)}
-    kept = [row("can", 0, name, step, diversity=pd[name][step]) for name in pd for step in (0, 1)]
+    kept = [
+        row("can", 0, method=name, step=step, diversity=pd[name][step])
+        for name in pd
+        for step in (0, 1)
+    ]
     own = [one for one in kept if one["method"] == "icp"]
     own[1] = own[1] | {"diversity": 50.000000000000007}  # the next number after 50
-    own += [row("can", 0, "mine", step, diversity=20.0) for step in (0, 1)]
+    own += [row("can", 0, method="mine", step=step, diversity=20.0) for step in (0, 1)]
     write_evaluation(tmp_path / "kept/made_up", kept, methods={"icp": {}}, outside={"package": ""})
     mine = write_evaluation(tmp_path / "mine", own, methods={"icp": {}, "mine": {}})
     agreed, differs, table = ranking(mine, tmp_path / "kept")
@@ -27,7 +31,8 @@ def test_an_entry_is_compared_to_the_bit_and_put_beside_the_others(tmp_path):
 
 
 def test_what_has_no_counterpart_is_one_line(tmp_path):
-    rows, methods = [row("can", 0, "icp", 1)], {"icp": {}}
+    rows = [row("can", 0, method="icp", step=1)]
+    methods = {"icp": {}}
     smoke = write_evaluation(tmp_path / "smoke", rows, methods=methods, name="smoke")
     other = write_evaluation(tmp_path / "other", rows, methods=methods, name="next_probe_scans")
     for words, message in (

@@ -31,11 +31,24 @@ def test_run_folders_differ_and_stay_in_the_log_folder(tmp_path, name):
 def test_a_trace_is_of_the_moment_at_which_it_was_handed_over(count):
     recorder = ListRecorder()
     random = np.random.default_rng(count)
-    vectors, cost = random.normal(size=(count, 9)), random.uniform(size=count)
+    vectors = random.normal(size=(count, 9))
+    cost = random.uniform(size=count)
     expected = digest(vectors, cost), cost.min(), np.median(cost), cost.max()
-    StepObserver(recorder, 0, 5, lambda *_: None).trace("descent", 10, vectors, cost)
+    StepObserver(recorder, 0, snapshot_interval=5, show=lambda *_: None).trace(
+        "descent", 10, vectors, cost
+    )
     vectors[:], cost[:] = 0.0, 0.0
-    assert recorder.events == [Traced(0, "descent", 10, *expected)]
+    assert recorder.events == [
+        Traced(
+            0,
+            "descent",
+            iteration=10,
+            digest=expected[0],
+            lowest_cost=expected[1],
+            median_cost=expected[2],
+            highest_cost=expected[3],
+        )
+    ]
 
 
 POSE = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))

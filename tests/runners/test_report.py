@@ -19,8 +19,10 @@ SUMMARY = "PD and its ratios over all registrations"
 
 
 def test_the_last_half_is_that_of_all_methods_of_a_trial():
-    rows = [row("can", 0, "chsel", step) for step in (3, 4, 5, 6)]
-    rows += [row("can", 0, "icp", step) for step in (7, 8)] + [row("can", 1, "icp", 3)]
+    rows = [row("can", 0, method="chsel", step=step) for step in (3, 4, 5, 6)]
+    rows += [row("can", 0, method="icp", step=step) for step in (7, 8)] + [
+        row("can", 1, method="icp", step=3)
+    ]
     kept = last_half(pd.DataFrame(rows))[["seed", "method", "step"]]
     assert list(kept.itertuples(index=False, name=None)) == [
         (0, "chsel", 6),
@@ -33,7 +35,7 @@ def test_the_last_half_is_that_of_all_methods_of_a_trial():
 def test_quartiles_are_of_the_numbers_that_there_are():
     numbers = {"a": [4.0, None, 1.0, None, 3.0, 2.0], "b": [2.5, 2.5], "c": [None, None, None]}
     rows = [{"of": of, "number": value} for of, values in numbers.items() for value in values]
-    found = spreads(pd.DataFrame(rows), "of", "number")
+    found = spreads(pd.DataFrame(rows), "of", column="number")
     by_hand = {"count": 4, "left_out": 2, "lower": 1.75, "median": 2.5, "upper": 3.25}
     by_hand |= {"mean": 2.5, "deviation": 1.25**0.5}
     assert found.loc["a"].to_dict() == pytest.approx(by_hand)
@@ -45,7 +47,7 @@ def test_quartiles_are_of_the_numbers_that_there_are():
 
 
 def test_without_faults_nothing_is_said_about_them(tmp_path):
-    rows = [row("can", 0, "icp", 4, diversity=8.0, truth_held=True, faults="clean")]
+    rows = [row("can", 0, method="icp", step=4, diversity=8.0, truth_held=True, faults="clean")]
     sections = sections_of(open_evaluation(write_evaluation(tmp_path, rows, methods={"icp": {}})))
     assert not [section.title for section in sections if "aults" in section.title]
     (held,) = [section for section in sections if section.title == "Whether sets hold the truth"]
@@ -55,7 +57,7 @@ def test_without_faults_nothing_is_said_about_them(tmp_path):
 
 @pytest.mark.parametrize("title", ["Time per registration", "Calibration and membership"])
 def test_a_section_without_its_text_is_an_error(tmp_path, monkeypatch, title):
-    folder = write_evaluation(tmp_path, [row("can", 0, "icp", 4, diversity=8.0)])
+    folder = write_evaluation(tmp_path, [row("can", 0, method="icp", step=4, diversity=8.0)])
     monkeypatch.delitem(_TEXTS, title)
     with pytest.raises(KeyError, match=title):
         sections_of(open_evaluation(folder))
@@ -64,7 +66,7 @@ def test_a_section_without_its_text_is_an_error(tmp_path, monkeypatch, title):
 def test_tables_hold_medians_over_trials_and_the_last_half_of_their_steps(tmp_path):
     values = {0: (1000.0, 10.0, 20.0), 1: (1000.0, 30.0, 60.0)}  # PD of seeds at steps 4, 5, 6
     rows = [
-        row("can", seed, method, step, diversity=factor * value, seconds=0.01 * factor)
+        row("can", seed, method=method, step=step, diversity=factor * value, seconds=0.01 * factor)
         for seed, found in values.items()
         for method, factor in (("chsel", 1.0), ("icp", 2.0))
         for step, value in zip((4, 5, 6), found, strict=True)
@@ -84,10 +86,11 @@ def test_tables_hold_medians_over_trials_and_the_last_half_of_their_steps(tmp_pa
 
 def test_what_has_no_number_is_left_out_and_counted(tmp_path):
     rows = [
-        row("can", 0, "chsel", 4, diversity=8.0, seconds=0.1),
-        row("can", 1, "chsel", 4, seconds=0.3) | {"status": "no plausible set: too few points"},
-        row("can", 0, "icp", 4, diversity=float("nan"), seconds=None),
-        row("can", 1, "icp", None) | {"status": "failed: the worker was killed"},
+        row("can", 0, method="chsel", step=4, diversity=8.0, seconds=0.1),
+        row("can", 1, method="chsel", step=4, seconds=0.3)
+        | {"status": "no plausible set: too few points"},
+        row("can", 0, method="icp", step=4, diversity=float("nan"), seconds=None),
+        row("can", 1, method="icp", step=None) | {"status": "failed: the worker was killed"},
     ]
     methods = {"chsel": {}, "icp": {}, "svgd": {}}
     write_evaluation(tmp_path, rows, configurations=["can"], seeds=[0, 1, 2], methods=methods)
@@ -140,8 +143,8 @@ def compared(tmp_path):
         ("own+1", 4, {"diversity": 400.0, **numbers, "exact_members": 0.8}),
         ("own", 5, {"diversity": 0.0, **numbers}),
     ]
-    rows = [row("can", 0, method, step, **values) for method, step, values in found]
-    rows.append(row("can", 0, "own+1", 5) | {"status": "failed: of a lack of memory"})
+    rows = [row("can", 0, method=method, step=step, **values) for method, step, values in found]
+    rows.append(row("can", 0, method="own+1", step=5) | {"status": "failed: of a lack of memory"})
     planned = {"configurations": ["can"], "seeds": [0], "methods": {"own": {}, "own+1": {}}}
     planned["outside"] = {"package": "sets", "package+1": "sets/draw_1"}
     return write_evaluation(tmp_path / "evaluation", rows, **planned)
@@ -171,7 +174,9 @@ def test_ratios_are_of_the_same_trial_and_step_by_the_mean_of_the_baselines_draw
 
 def test_a_pd_equal_to_the_baselines_is_not_worse(tmp_path):
     values = {"package": 8.0, "icp": 8.0, "svgd": 8.1, "cvo": 7.9}
-    rows = [row("can", 0, method, 4, diversity=value) for method, value in values.items()]
+    rows = [
+        row("can", 0, method=method, step=4, diversity=value) for method, value in values.items()
+    ]
     header, *lines = tables_of(write_evaluation(tmp_path, rows), "package")[SUMMARY]
     shares = {line[0]: line[header.index("worse")] for line in lines}
     assert shares == {"SVGD": "100.0 %", "ICP": "0.0 %", "CVO": "0.0 %", "package": "-"}
@@ -180,7 +185,7 @@ def test_a_pd_equal_to_the_baselines_is_not_worse(tmp_path):
 def test_pd_over_probes_is_the_median_and_quartiles_of_each_object_and_step(tmp_path):
     numbers = {"can": {4: (16.0, 1.0, 4.0), 5: (25.0, 9.0)}, "box": {5: (100.0, 400.0)}}
     rows = [
-        row(name, seed, method, step, diversity=factor * value)
+        row(name, seed, method=method, step=step, diversity=factor * value)
         for name, steps in numbers.items()
         for step, values in steps.items()
         for seed, value in enumerate(values)
@@ -189,7 +194,7 @@ def test_pd_over_probes_is_the_median_and_quartiles_of_each_object_and_step(tmp_
     ]
     styles = styles_of(["chsel", "icp"])
     evaluation = open_evaluation(write_evaluation(tmp_path, rows))
-    picture = pd_over_probes("pd", evaluation.rows, styles)
+    picture = pd_over_probes("pd", evaluation.rows, styles=styles)
     assert [axes.get_title() for axes in picture.figure.axes] == ["box", "can"]
     drawn = picture.data[picture.data["object"] == "can"].drop(columns="object")
     assert drawn.to_numpy().tolist() == [
@@ -209,7 +214,7 @@ def test_each_panel_over_iterations_draws_its_own_number_and_costs_of_one_kind(t
         for seed, start in enumerate((1.0, 3.0, 8.0))
         for iteration, value in ((0, 2.0 * start), (25, start))
     ]
-    folder = write_evaluation(tmp_path, [], moments, methods=methods)
+    folder = write_evaluation(tmp_path, [], iterations=moments, methods=methods)
     section = sections_of(open_evaluation(folder))[1]
     data = section.picture.data.set_index(["number", "method", "iteration"]).sort_index()
     values = ["lower", "median", "upper"]
@@ -253,7 +258,7 @@ def test_a_report_has_its_pictures_its_data_and_the_same_bytes_each_time(compare
     ],
 )
 def test_a_mistake_is_one_line(tmp_path, arguments, message):
-    write_evaluation(tmp_path, [row("can", 0, "chsel", 4, diversity=1.0)])
+    write_evaluation(tmp_path, [row("can", 0, method="chsel", step=4, diversity=1.0)])
     done = run(report.main, *(argument.format(tmp_path) for argument in arguments))
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert message in done.stderr

@@ -41,11 +41,11 @@ def scene(tmp_path_factory):
     assert do_task(plan, Task(TRIAL)) == ""
     session = open_recorded(plan, TRIAL)
     truth = session.world_from_object
-    rows = ResultRows(plan, TRIAL, session, "made_up")
-    problem = list(problems(plan, TRIAL, session))[-1]
+    rows = ResultRows(plan, TRIAL, session=session, label="made_up")
+    problem = list(problems(plan, TRIAL, session=session))[-1]
     members, _ = rows.members(problem)
     cost = EvaluationCost(problem, plan.plausible_settings(EPSILON).cost)
-    return Scene(rows, session, truth, problem, members, cost)
+    return Scene(rows, session, truth=truth, problem=problem, members=members, cost=cost)
 
 
 def hypotheses(world_from_object):
@@ -53,10 +53,16 @@ def hypotheses(world_from_object):
     count = len(world_from_object)
     poses = inverse(world_from_object)
     cell = np.full(count, -1)
-    return Hypotheses(poses, np.arange(float(count)), np.zeros(count, dtype=bool), cell, poses)
+    return Hypotheses(
+        poses,
+        np.arange(float(count)),
+        duplicate=np.zeros(count, dtype=bool),
+        cell=cell,
+        elites=poses,
+    )
 
 
-def moved(truth, shifts, turns):
+def moved(truth, shifts, *, turns):
     """The true pose moved by shifts (B, 3) and turned by rotation vectors (B, 3)."""
     rotation = product(rotation_vector(turns), truth[:3, :3])
     return compose(rotation, truth[:3, 3] + shifts)
@@ -65,11 +71,11 @@ def moved(truth, shifts, turns):
 def test_errors_are_those_of_the_best_hypothesis(scene):
     shifts = np.array([[0.012, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.0, 0.1]])
     turns = np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [0.3, 0.0, 0.0]])
-    shifted = hypotheses(moved(scene.truth, shifts, turns))
+    shifted = hypotheses(moved(scene.truth, shifts, turns=turns))
     row = scene.rows.row(scene.problem, shifted)
     assert row["position_error"] == pytest.approx(0.012)
     assert row["rotation_error"] == pytest.approx(0.0, abs=1e-6)
-    turned = hypotheses(moved(scene.truth, shifts[::-1], turns[::-1]))
+    turned = hypotheses(moved(scene.truth, shifts[::-1], turns=turns[::-1]))
     row = scene.rows.row(scene.problem, turned)
     assert row["rotation_error"] == pytest.approx(0.3)
     assert (row["best_cost"], row["mean_cost"]) == (0.0, 1.0)
@@ -79,7 +85,7 @@ def test_errors_are_those_of_the_best_hypothesis(scene):
 def test_exact_members_are_those_within_one_epsilon_of_the_true_cost(scene):
     stream = np.random.default_rng(0)
     shifts, turns = stream.normal(0.0, 0.003, (4000, 3)), stream.normal(0.0, 0.02, (4000, 3))
-    poses = moved(scene.truth, shifts, turns)
+    poses = moved(scene.truth, shifts, turns=turns)
     above = scene.cost.evaluate(inverse(poses)) - scene.members.true_cost
     inside = poses[above < 0.95 * EPSILON][:3]
     near = poses[(above > 1.05 * EPSILON) & (above < 2.5 * EPSILON)][:5]
@@ -92,22 +98,22 @@ def test_exact_members_are_those_within_one_epsilon_of_the_true_cost(scene):
 
 def test_all_steps_of_a_session_are_measured_by_the_same_points_on_the_surface(scene):
     stream = np.random.default_rng(1)
-    found = hypotheses(moved(scene.truth, stream.normal(0.0, 0.02, (5, 3)), np.zeros((5, 3))))
+    found = hypotheses(moved(scene.truth, stream.normal(0.0, 0.02, (5, 3)), turns=np.zeros((5, 3))))
     mesh = scene.session.recorded.mesh
 
-    def measured(metrics, seed, step):
+    def measured(metrics, seed, *, step):
         return metrics.compute(
-            replace(scene.problem, key=StreamKey(seed, step)), scene.members, found
+            replace(scene.problem, key=StreamKey(seed, step)), scene.members, found=found
         )
 
     def fresh():
-        return HypothesisMetrics(MetricsConfig(points=50), mesh, scene.truth)
+        return HypothesisMetrics(MetricsConfig(points=50), mesh, world_from_object=scene.truth)
 
     one = fresh()
-    first = measured(one, 0, 4)
-    assert measured(one, 0, 5) == first
-    assert measured(fresh(), 0, 5) == first  # of a run that went on at this step
-    assert measured(fresh(), 1, 4)["diversity"] != first["diversity"]
+    first = measured(one, 0, step=4)
+    assert measured(one, 0, step=5) == first
+    assert measured(fresh(), 0, step=5) == first  # of a run that went on at this step
+    assert measured(fresh(), 1, step=4)["diversity"] != first["diversity"]
 
 
 def test_seeds_of_draws_are_no_seeds_of_other_sessions():

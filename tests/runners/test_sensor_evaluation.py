@@ -55,9 +55,12 @@ def test_configurations_are_simulated_unless_there_are_logs_of_ones_own(tmp_path
     assert [own[name].object for name in own] == ["drill", "mustard", "drill"]
     assert own["shelf"].probes is None
     objects = {name: one.object for name, one in own.items()}
-    assert chosen_names("configurations", "drill", own, objects) == ("cabinet_drill", "table")
+    assert chosen_names("configurations", "drill", existing=own, objects=objects) == (
+        "cabinet_drill",
+        "table",
+    )
     with pytest.raises(SettingError, match="configurations names 'box'; accepted: all, an object"):
-        chosen_names("configurations", "box", own, objects)
+        chosen_names("configurations", "box", existing=own, objects=objects)
 
 
 def test_objects_of_logs_are_of_real_size_unless_their_file_says_otherwise(tmp_path):
@@ -94,13 +97,14 @@ def test_a_folder_of_logs_must_name_its_object(tmp_path):
 
 def test_logs_of_ones_own_need_a_guess_and_simulated_ones_are_made(tmp_path):
     logs = own_logs(tmp_path / "logs", shelf={"name": "mustard"})
-    plan, trial = sensors_plan(tmp_path, logs=logs), Trial(0, "shelf")
+    plan = sensors_plan(tmp_path, logs=logs)
+    trial = Trial(0, "shelf")
     assert not is_missing(plan, trial)
     with pytest.raises(SettingError, match=r"no seed_0.pose.yaml beside .*: .*runners.align"):
         check_log(plan, trial)
     with pytest.raises(SettingError, match=r"no .*seed_7.mcap; accepted: seeds of which"):
         check_log(plan, Trial(7, "shelf"))
-    write_pose(beside(trial.log(plan)), POSE, {})
+    write_pose(beside(trial.log(plan)), POSE, about={})
     check_log(plan, trial)
     np.testing.assert_allclose(guessed_pose(trial.log(plan)), POSE, atol=1e-12)
     (logs / "shelf" / "seed_1").mkdir()
@@ -146,7 +150,8 @@ def test_a_trial_gets_its_log_its_true_pose_and_its_results(tmp_path, monkeypatc
         probes=2, camera=CameraSettings(width=96), bubbles=BubbleSettings(width=96)
     )
     monkeypatch.setattr("runners.evaluation.true_poses.RobotSettings", lambda: small)
-    plan, trial = sensors_plan(tmp_path), Trial(0, "cabinet_drill")
+    plan = sensors_plan(tmp_path)
+    trial = Trial(0, "cabinet_drill")
     assert do_task(plan, Task(trial)) == ""
     log = trial.log(plan)
     assert {file.name for file in log.parent.iterdir()} == {"seed_0.mcap", f"seed_0{TRUTH}"}

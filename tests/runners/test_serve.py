@@ -42,7 +42,8 @@ ON_BOX += [[0.03, 0.02, 0.1], [-0.04, -0.02, 0.1], [0.0, -0.03, -0.04], [-0.02, 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
     """The address of a server in a thread, and the folder of its recordings."""
-    folder, listening = tmp_path_factory.mktemp("served"), socket.create_server(("127.0.0.1", 0))
+    folder = tmp_path_factory.mktemp("served")
+    listening = socket.create_server(("127.0.0.1", 0))
     options = {"sock": listening, "handle_signals": False, "print": None}
     options["loop"] = asyncio.new_event_loop()
     served = (Server(TOKEN, folder).app,)
@@ -79,18 +80,19 @@ def outcomes(path):
 
 
 def test_two_clients_at_once_get_what_the_library_gives_and_recordings_repeat(server):
-    (address, folder), places = server, np.array([[0.4, 0.1, 0.2], [0.8, -0.1, 0.3]])
+    (address, folder) = server
+    places = np.array([[0.4, 0.1, 0.2], [0.8, -0.1, 0.3]])
 
     def client(number):
         path = opened(address, seed=number, hand=OF_HAND, record=f"client_{number}.mcap")
         contacts = (places[number] + ON_BOX).tolist()
         ask(address, f"{path}/add", contacts=contacts[:4])
-        ask(address, f"{path}/register", b"")
-        _, probe = ask(address, f"{path}/next_probe", b"{}")
+        ask(address, f"{path}/register", body=b"")
+        _, probe = ask(address, f"{path}/next_probe", body=b"{}")
         _, added = ask(address, f"{path}/add", contacts=contacts[4:])
         assert added["points"] == {"known": 8, "free": 0, "occupied": 0}
-        _, found = ask(address, f"{path}/register", b"{}")
-        assert ask(address, f"{path}/close", b"") == (200, {"step": 1})
+        _, found = ask(address, f"{path}/register", body=b"{}")
+        assert ask(address, f"{path}/close", body=b"") == (200, {"step": 1})
         return probe, found
 
     with ThreadPoolExecutor(2) as pool:
@@ -112,7 +114,9 @@ def test_two_clients_at_once_get_what_the_library_gives_and_recordings_repeat(se
 def test_others_are_answered_during_a_registration_and_its_own_session_waits(server, monkeypatch):
     address, _ = server
     path, other = opened(address), opened(address)
-    entered, go_on, register = threading.Event(), threading.Event(), chsel.Session.register
+    entered = threading.Event()
+    go_on = threading.Event()
+    register = chsel.Session.register
 
     def slow(session):
         entered.set()
@@ -133,13 +137,14 @@ def test_others_are_answered_during_a_registration_and_its_own_session_waits(ser
     assert added.result()[1]["step"] == 1
 
 
-def packed(shape, data=b"\0" * 24, dtype="float32"):
+def packed(shape, data=b"\0" * 24, *, dtype="float32"):
     return {"dtype": dtype, "shape": shape, "base64": base64.b64encode(data).decode()}
 
 
 def test_a_mistake_is_one_line(server):
     address, folder = server
-    path, box = opened(address), {"target": TARGET}
+    path = opened(address)
+    box = {"target": TARGET}
     (folder / "there.mcap").touch()
     for where, body, text in (
         ("", [1], "the body is [1]; accepted: a JSON object"),
@@ -157,10 +162,12 @@ def test_a_mistake_is_one_line(server):
         ("/next_probe", {"length": [1]}, "actions are incomplete; accepted:"),
     ):
         whole = f"{path}{where}" if where else "/sessions"
-        status, answer = ask(address, whole, json.dumps(body).encode())
+        status, answer = ask(address, whole, body=json.dumps(body).encode())
         assert (status, answer["error"][: len(text)]) == (400, text)
         assert "\n" not in answer["error"]
-    assert ask(address, "/sessions", b"{")[1]["error"].startswith("the body is not JSON (Expecting")
+    assert ask(address, "/sessions", body=b"{")[1]["error"].startswith(
+        "the body is not JSON (Expecting"
+    )
     for where, body, text in (
         (
             "/sessions",
@@ -175,8 +182,8 @@ def test_a_mistake_is_one_line(server):
         status, answer = ask(address, where, **(box | body))
         assert (status, answer["error"][: len(text)]) == (400, text)
         assert "\n" not in answer["error"]
-    assert ask(address, f"/sessions/{'a' * 20_000}/add", b"")[0] == 404
-    assert [ask(address, f"{path}/close", b"")[0] for _ in range(2)] == [200, 404]
+    assert ask(address, f"/sessions/{'a' * 20_000}/add", body=b"")[0] == 404
+    assert [ask(address, f"{path}/close", body=b"")[0] for _ in range(2)] == [200, 404]
     refused = "the token is missing or wrong; accepted: Authorization: Bearer TOKEN"
     for token in ("", TOKEN[:-1], f"{TOKEN}."):
         for where in ("/sessions", "/elsewhere"):
@@ -185,7 +192,8 @@ def test_a_mistake_is_one_line(server):
 
 def test_a_body_is_unpacked_where_it_says_how(server):
     address, _ = server
-    path, values = opened(address), json.dumps({"contacts": ON_BOX}).encode()
+    path = opened(address)
+    values = json.dumps({"contacts": ON_BOX}).encode()
     squeezed, whole = gzip.compress(values), zlib.compress(values)
     for encoding, body, status, text in (
         ("gzip", squeezed, 200, ""),
@@ -197,7 +205,7 @@ def test_a_body_is_unpacked_where_it_says_how(server):
         ("zstd", values, 400, "Content-Encoding is 'zstd'; accepted: "),
         ("x" * 5000, values, 400, "Content-Encoding is "),
     ):
-        found = ask(address, f"{path}/add", body, encoding=encoding)
+        found = ask(address, f"{path}/add", body=body, encoding=encoding)
         assert found[0] == status
         assert found[1].get("error", "").startswith(text)
     assert ask(address, "/sessions")[1]["sessions"][-1]["step"] == 2
@@ -211,25 +219,26 @@ def test_a_client_that_hangs_up_leaves_the_session_and_its_recording_whole(serve
     for rest in (b"Content-Length: 99\r\n\r\n{", b"Content-Length: 2\r\n\r\n{}"):
         with socket.create_connection(address.split(":")) as connection:
             connection.sendall(head.format("register").encode() + rest)
-    status, answer = ask(address, f"{path}/register", b"{}")
+    status, answer = ask(address, f"{path}/register", body=b"{}")
     assert (status, answer["step"]) == (200, 0)
-    ask(address, f"{path}/close", b"")
+    ask(address, f"{path}/close", body=b"")
     assert outcomes(folder / "left.mcap") == ([0], "finished")
 
 
 def test_packed_arrays_are_the_same_as_lists(server):
     above = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.5], [0, 0, 0, 1]]
     camera = {"camera": [[60, 0, 7.5], [0, 60, 5.5], [0, 0, 1]], "world_from_camera": above}
-    depth, mask = 470 + np.arange(192).reshape(12, 16), np.arange(192).reshape(12, 16) % 16 < 11
-    scaled = packed(depth.shape, depth.astype("<u2").tobytes(), "uint16") | {"scale": 0.001}
+    depth = 470 + np.arange(192).reshape(12, 16)
+    mask = np.arange(192).reshape(12, 16) % 16 < 11
+    scaled = packed(depth.shape, depth.astype("<u2").tobytes(), dtype="uint16") | {"scale": 0.001}
     ways = {
         "lists": {"depth": (0.001 * depth).tolist(), "mask": mask.tolist()},
-        "packed": {"depth": scaled, "mask": packed(mask.shape, mask.tobytes(), "uint8")},
+        "packed": {"depth": scaled, "mask": packed(mask.shape, mask.tobytes(), dtype="uint8")},
     }
     for name, way in ways.items():
         path = opened(server[0], record=f"{name}.mcap")
         assert ask(server[0], f"{path}/add", **way, **camera)[0] == 200
-        ask(server[0], f"{path}/close", b"")
+        ask(server[0], f"{path}/close", body=b"")
     first, second = ((server[1] / f"{name}.mcap").read_bytes() for name in ways)
     assert first == second
 
@@ -247,8 +256,9 @@ def test_the_command_serves_until_a_signal_whatever_clients_do(tmp_path, ending)
     token = next(lines).removeprefix("token: ").strip()
     ask(address, "/sessions", token=token, target=TARGET, record="open.mcap")
     ask(address, "/sessions/1/add", token=token, contacts=ON_BOX)
-    assert ask(address, "/sessions/1/register", b"", token=token)[0] == 200
-    stalled, line = [], "POST /sessions/1/add HTTP/1.1\r\nHost: x\r\n"
+    assert ask(address, "/sessions/1/register", body=b"", token=token)[0] == 200
+    stalled = []
+    line = "POST /sessions/1/add HTTP/1.1\r\nHost: x\r\n"
     parts = ("Content-Length: 9\r\n\r\n{", "Transfer-Encoding: chunked\r\n\r\n9\r\n{", "")
     for part in parts:  # half a body, half a chunk, half of the headers
         for hangs_up in (True, False):
@@ -272,7 +282,9 @@ def test_the_command_serves_until_a_signal_whatever_clients_do(tmp_path, ending)
 def test_a_computation_holds_up_no_other_recording_and_what_waits_is_not_begun(
     tmp_path, monkeypatch
 ):
-    entered, go_on, begun = threading.Event(), threading.Event(), []
+    entered = threading.Event()
+    go_on = threading.Event()
+    begun = []
 
     def slow(session):
         begun.append(session)
@@ -281,7 +293,8 @@ def test_a_computation_holds_up_no_other_recording_and_what_waits_is_not_begun(
         raise SessionError("enough")
 
     monkeypatch.setattr(chsel.Session, "register", slow)
-    listening, loop = socket.create_server(("127.0.0.1", 0)), asyncio.new_event_loop()
+    listening = socket.create_server(("127.0.0.1", 0))
+    loop = asyncio.new_event_loop()
     address = f"127.0.0.1:{listening.getsockname()[1]}"
     runner = web.AppRunner(Server(TOKEN, tmp_path).app, shutdown_timeout=0.5)
     loop.run_until_complete(runner.setup())

@@ -38,7 +38,8 @@ def test_a_log_and_its_truth_are_written(tmp_path):
     assert "probe   0  y" in done.stdout
     assert "nothing touched" in done.stdout
 
-    before, other = log.read_bytes(), ("configuration=cabinet_mustard", "seed=5", *QUICK)
+    before = log.read_bytes()
+    other = ("configuration=cabinet_mustard", "seed=5", *QUICK)
     again = run(simulate_rig.main, f"out={log}", *other)
     assert again.returncode == 2
     assert "exists; accepted: another out=FILE.mcap, or overwrite=true" in again.stderr
@@ -75,7 +76,7 @@ def test_a_mistake_is_one_line(arguments, said, tmp_path, monkeypatch):
 
 def test_the_rig_of_the_cabinet_describes_the_twin():
     values = yaml.safe_load((CONF / "session" / "rig" / "cabinet.yaml").read_text())
-    rig = build_settings(Rig, values, "rig")
+    rig = build_settings(Rig, values, where="rig")
     assert rig.world == WORLD
     assert rig.box().lower == CABINET_WORKSPACE.lower
     assert rig.box().upper == CABINET_WORKSPACE.upper

@@ -35,7 +35,7 @@ sys.meta_path.insert(0, Interrupts())
 """
 
 
-def ran(words, folder, code, **changes):
+def ran(words, folder, *, code, **changes):
     """`python -m words`, with code that Python runs before anything else."""
     (folder / "sitecustomize.py").write_text(code)
     environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{REPOSITORY}", **changes}
@@ -62,7 +62,7 @@ def test_help_shows_the_choices_made_and_mistakes_are_errors():
 
 @pytest.mark.parametrize("verb", ["", *VERBS])
 def test_help_of_replay_waits_for_no_heavy_import(verb, tmp_path):
-    done = ran(["replay", *([verb] if verb else []), "--help"], tmp_path, LISTED)
+    done = ran(["replay", *([verb] if verb else []), "--help"], tmp_path, code=LISTED)
     assert (done.returncode, done.stderr) == (0, "[]\n")
     assert "usage: replay" in done.stdout
 
@@ -117,7 +117,7 @@ def test_registrations_import_nothing_that_they_do_not_need():
     ids=str,
 )
 def test_ctrl_c_during_imports_ends_a_command_quietly(words, module, tmp_path):
-    done = ran(words, tmp_path, INTERRUPTED.format(module=module))
+    done = ran(words, tmp_path, code=INTERRUPTED.format(module=module))
     assert done.returncode == -signal.SIGINT  # which a shell shows as 130
     assert done.stderr == ""
 
@@ -129,6 +129,6 @@ def test_the_published_package_in_our_place_is_named(tmp_path):
     (theirs / "__init__.py").write_text("from chsel.wrapper import CHSEL")
     (theirs / "wrapper.py").write_text("import pytorch_kinematics")
     for words in (["runners.probe"], ["runners.report", "--help"], ["replay", "info", "x"]):
-        done = ran(words, tmp_path, "")
+        done = ran(words, tmp_path, code="")
         assert (done.returncode, done.stdout) == (2, "")
         assert done.stderr == f"error: {WRONG_PACKAGE.format(theirs)}\n"

@@ -101,7 +101,8 @@ def mean_error(start, poses):
 
 def check_decision(row, recording):
     """The forecasts are those of the decision before the probe, the rest of the one after it."""
-    before, after = (recording.decision(row["step"] - 1), recording.decision(row["step"]))
+    before = recording.decision(row["step"] - 1)
+    after = recording.decision(row["step"])
     chosen = before.decision.chosen
     assert row["action"] == chosen
     assert row["hit_forecast"] == before.decision.hit_chance[chosen]
@@ -118,19 +119,38 @@ def check_decision(row, recording):
 
 
 def test_the_usual_rules_stop_at_a_narrow_belief_or_where_little_is_promised():
-    assert usual_stop(0.005, 0.05, 0.2, "") == "spread"
-    assert usual_stop(0.005, 0.05, 0.2, "determined") == "spread"
-    assert usual_stop(0.005, 0.05, 0.2, "wide") == ""
-    assert usual_stop(0.005, 0.0001, 0.2, "wide") == "gain"
-    assert usual_stop(0.1, 0.05, 0.2, "wide") == usual_stop(0.1, None, 0.2, "wide") == ""
+    assert usual_stop(0.005, 0.05, diameter=0.2, verdict="") == "spread"
+    assert usual_stop(0.005, 0.05, diameter=0.2, verdict="determined") == "spread"
+    assert usual_stop(0.005, 0.05, diameter=0.2, verdict="wide") == ""
+    assert usual_stop(0.005, 0.0001, diameter=0.2, verdict="wide") == "gain"
+    assert (
+        usual_stop(0.1, 0.05, diameter=0.2, verdict="wide")
+        == usual_stop(0.1, None, diameter=0.2, verdict="wide")
+        == ""
+    )
 
 
 def believed(sdf, world_from_object):
     """The belief of members at these poses (K, 4, 4)."""
     count = len(world_from_object)
-    none = np.zeros(count, dtype=bool), np.full(count, -1), np.zeros((0, 4, 4))
-    trust = Trust(0.001, 0.0, 0.5, 0, 0.01, "wide", 6, ())
-    found = Hypotheses(inverse(world_from_object), np.arange(count) * 1.0, *none, trust=trust)
+    trust = Trust(
+        noise=0.001,
+        outliers=0.0,
+        misfit=0.5,
+        modes=0,
+        spread=0.01,
+        verdict="wide",
+        redundancy=6,
+        best_of_modes=(),
+    )
+    found = Hypotheses(
+        inverse(world_from_object),
+        np.arange(count) * 1.0,
+        duplicate=np.zeros(count, dtype=bool),
+        cell=np.full(count, -1),
+        elites=np.zeros((0, 4, 4)),
+        trust=trust,
+    )
     return PoseBelief(sdf, found)
 
 
@@ -150,7 +170,9 @@ def test_the_middle_of_the_members_has_the_true_pose_or_not():
         ([0.3, 0.2, 0.6], (0, 0)),
     ):
         truth = compose(np.eye(3), np.array(place))
-        row = belief_numbers(believed(sdf, members), mesh, sdf, truth, key)
+        row = belief_numbers(
+            believed(sdf, members), mesh, sdf=sdf, world_from_object=truth, key=key
+        )
         assert (row["middle_50"], row["middle_90"]) == pytest.approx(middles)
 
 
@@ -162,21 +184,23 @@ def test_turns_count_by_how_far_they_move_the_surface():
     mesh = trimesh.creation.box([0.05, 0.06, 0.07])
     sdf = SdfGrid.from_mesh(mesh, 0.005)
     random = np.random.default_rng(0)
-    places, angles = random.uniform(-0.05, 0.05, (400, 3)), random.uniform(-0.5, 0.5, 400)
+    places = random.uniform(-0.05, 0.05, (400, 3))
+    angles = random.uniform(-0.5, 0.5, 400)
     turns = axis_angle(np.tile([0.0, 0.0, 1.0], (400, 1)), angles)
     truth = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.7)), np.zeros(3))
     members = believed(sdf, compose(turns, places))
-    row = belief_numbers(members, mesh, sdf, truth, StreamKey(0, 0))
+    row = belief_numbers(members, mesh, sdf=sdf, world_from_object=truth, key=StreamKey(0, 0))
     assert (row["middle_50"], row["middle_90"]) == (1.0, 1.0)
 
 
 def test_the_best_grasp_works_where_most_members_have_the_object():
     mesh = trimesh.creation.box([0.05, 0.06, 0.07])
     sdf = SdfGrid.from_mesh(mesh, 0.005)
-    here, there = np.eye(4), compose(np.eye(3), np.array([0.0, 1.0, 0.0]))
+    here = np.eye(4)
+    there = compose(np.eye(3), np.array([0.0, 1.0, 0.0]))
     belief = believed(sdf, np.stack([here, here, there]))
     for truth, works in ((here, True), (there, False)):
-        row = belief_numbers(belief, mesh, sdf, truth, StreamKey(0, 0))
+        row = belief_numbers(belief, mesh, sdf=sdf, world_from_object=truth, key=StreamKey(0, 0))
         assert row["grasp_chance"] == pytest.approx(2 / 3)
         assert row["grasp_works"] is works
 
@@ -272,7 +296,7 @@ def test_a_registration_that_fails_is_a_row_with_the_error_of_the_one_before(tmp
         recordings=False,
     )
     plan.session.update(start_contacts=1, start_probe=0)
-    join_experiment(plan, "test", ["mustard"], [20])
+    join_experiment(plan, "test", configurations=["mustard"], seeds=[20])
     assert do_task(plan, Task(Trial(20, "mustard"), "grid")) == ""
     first, second = collect(plan.folder).to_pylist()
     assert (first["status"], second["status"]) == ("ok", "failed: ValueError: no luck")

@@ -22,8 +22,10 @@ from tests.runners.made_up_evaluations import session, tables_of, write_sessions
 BUDGETS = {"information": 4, "grid": 4}
 
 
-def sessions_of(folder, rows, reference=None):
-    return steered_sessions(open_evaluation(write_sessions(folder, rows, BUDGETS)), reference)
+def sessions_of(folder, rows, *, reference=None):
+    return steered_sessions(
+        open_evaluation(write_sessions(folder, rows, budgets=BUDGETS)), reference
+    )
 
 
 @pytest.fixture
@@ -33,12 +35,14 @@ def rows():
     forecasts |= {"grasp_chance": [None, 0.75, 0.72, 1.0], "grasp_works": [None, False, True, True]}
     forecasts |= {"middle_50": [None, 1 / 3, 1.0, 0.0], "middle_90": [None, 2 / 3, 1.0, 1.0]}
     return [
-        *session("can", 20, "information", [80.0, 8.0, 4.0, 2.0], **forecasts),
-        *session("can", 20, "grid", [80.0, 40.0, 20.0, 10.0]),
-        *session("can", 21, "information", [50.0, 25.0, 9.0]),  # then no action is left
-        *session("can", 21, "grid", [50.0, 60.0, 30.0, 3.0]),
-        *session("drill", 20, "information", [60.0, 60.0, 60.0, 60.0]),
-        *session("drill", 20, "grid", [60.0, 70.0, 65.0, 30.0]),
+        *session("can", 20, policy="information", errors=[80.0, 8.0, 4.0, 2.0], **forecasts),
+        *session("can", 20, policy="grid", errors=[80.0, 40.0, 20.0, 10.0]),
+        *session(
+            "can", 21, policy="information", errors=[50.0, 25.0, 9.0]
+        ),  # then no action is left
+        *session("can", 21, policy="grid", errors=[50.0, 60.0, 30.0, 3.0]),
+        *session("drill", 20, policy="information", errors=[60.0, 60.0, 60.0, 60.0]),
+        *session("drill", 20, policy="grid", errors=[60.0, 70.0, 65.0, 30.0]),
     ]
 
 
@@ -62,12 +66,14 @@ def test_sessions_are_compared_up_to_the_smallest_budget(tmp_path, rows, monkeyp
 
 
 def test_errors_below_a_tenth_of_a_millimetre_count_as_that(tmp_path):
-    found = sessions_of(tmp_path, session("can", 20, "information", [80.0, 8.0, 4.0, 0.0]))
+    found = sessions_of(
+        tmp_path, session("can", 20, policy="information", errors=[80.0, 8.0, 4.0, 0.0])
+    )
     assert geometric_means(found.errors).loc["information", 4] == pytest.approx(LEAST_ERROR)
 
 
 def test_policies_are_compared_in_the_trials_that_all_have_finished(tmp_path, rows):
-    more = session("drill", 21, "grid", [1.0, 1.0, 1.0, 1.0])
+    more = session("drill", 21, policy="grid", errors=[1.0, 1.0, 1.0, 1.0])
     failed = {**more[0], "policy": "information", "probes": None, "step": None, "error": None}
     failed |= {"status": "failed: out of memory"}
     found = sessions_of(tmp_path, [*rows, *more, failed])
@@ -83,13 +89,17 @@ def test_ratios_are_by_session_with_wins_and_an_interval(tmp_path, rows):
     assert of["mean"] == pytest.approx((5.0 / 3.0 / 2.0) ** (1 / 3))
     # Of so few configurations the three sessions are drawn: one of them alone in 1 of 27 samples.
     assert (of["lower"], of["upper"]) == pytest.approx((1.0 / 3.0, 5.0))
-    back = paired(sessions_of(tmp_path / "back", rows, "grid"), "information")
+    back = paired(sessions_of(tmp_path / "back", rows, reference="grid"), "information")
     assert back["mean"] == pytest.approx(1.0 / of["mean"])
     assert (back["wins"], back["losses"]) == (of["losses"], of["wins"])
 
 
 def test_equal_errors_are_neither_wins_nor_losses(tmp_path):
-    rows = [row for name in BUDGETS for row in session("can", 20, name, [80.0, 8.0, 4.0, 2.0])]
+    rows = [
+        row
+        for name in BUDGETS
+        for row in session("can", 20, policy=name, errors=[80.0, 8.0, 4.0, 2.0])
+    ]
     of = paired(sessions_of(tmp_path, rows), "grid")
     assert [of[name] for name in ("wins", "losses", "sign_test")] == [0, 0, 1.0]
 
@@ -107,13 +117,13 @@ def test_a_single_session_has_no_interval_but_its_number():
     index = pd.MultiIndex.from_tuples([("can", 20)], names=["configuration", "seed"])
     interval = bootstrap_interval(pd.Series([0.5], index))
     assert np.isnan(interval).all()
-    assert with_range(0.5, *interval) == "0.5"
+    assert with_range(0.5, interval[0], upper=interval[1]) == "0.5"
 
 
 def test_tables_have_the_numbers_of_the_sessions(tmp_path, rows):
     for row in rows:
         row |= {"seconds": 0.05, "decision_seconds": None if row["policy"] == "grid" else 0.02}
-    tables = tables_of(write_sessions(tmp_path, rows, BUDGETS))
+    tables = tables_of(write_sessions(tmp_path, rows, budgets=BUDGETS))
     needed = tables["Probes until the error of the set is below a limit"]
     assert [line[:4] for line in needed[1:]] == [
         ["information", "3 [2, >4]", "3 [2, >4]", ">4 [3, >4]"],
@@ -159,7 +169,7 @@ def test_tables_have_the_numbers_of_the_sessions(tmp_path, rows):
 
 
 def test_a_table_of_before_beliefs_were_measured_is_read(tmp_path, rows):
-    folder = write_sessions(tmp_path, rows, BUDGETS)
+    folder = write_sessions(tmp_path, rows, budgets=BUDGETS)
     columns = ["middle_50", "middle_90", "grasp_chance", "grasp_works"]
     table = pyarrow.parquet.read_table(folder / "probes.parquet").drop_columns(columns)
     pyarrow.parquet.write_table(table, folder / "probes.parquet")
@@ -169,7 +179,7 @@ def test_a_table_of_before_beliefs_were_measured_is_read(tmp_path, rows):
 
 
 def test_a_report_is_written_and_a_baseline_without_sessions_is_an_error(tmp_path, rows):
-    write_sessions(tmp_path, rows, BUDGETS)
+    write_sessions(tmp_path, rows, budgets=BUDGETS)
     done = run(report.main, str(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
     assert "Error beside information after 4 probes" in done.stdout

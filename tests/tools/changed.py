@@ -27,7 +27,8 @@ def changed_files():
 
 def tests_of(file):
     """Return the test files of a changed file's room: those named after it, and the others."""
-    top, words = file.parts[0], {file.stem.removeprefix("test_")}
+    top = file.parts[0]
+    words = {file.stem.removeprefix("test_")}
     if top in ("docs", "examples") or file.suffix == ".md":
         folder = ROOT / "tests" / "docs"
     elif top == "conf":

@@ -42,7 +42,8 @@ def versions():
 
 def other_versions():
     """Which packages are not those with which golden.json was made; empty if all are."""
-    made, here = json.loads(GOLDEN_FILE.read_text())["versions"], versions()
+    made = json.loads(GOLDEN_FILE.read_text())["versions"]
+    here = versions()
     other = (f"{name} {here[name]} for {made[name]}" for name in here if here[name] != made[name])
     return ", ".join(other)
 

@@ -75,7 +75,7 @@ def mutants_of(file):
     yield from ((file, SWAPPED, occurrence) for occurrence in range(len(swappable(code))))
 
 
-def calls(code, names=None, but=()):
+def calls(code, names=None, *, but=()):
     """The calls of the functions of those names, or of all but some."""
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Call):
@@ -91,7 +91,7 @@ def swappable(code):
     return [pair for pair in pairs if not any(isinstance(each, ast.Starred) for each in pair)]
 
 
-def changed(code, operator, occurrence):
+def changed(code, operator, *, occurrence):
     """The code of a mutant."""
     if operator != SWAPPED:
         return mutate_code(code, get_operator(f"core/{operator}")(), occurrence) or code
@@ -125,7 +125,7 @@ def copied_to(folder):
             shutil.copy2(ROOT / name, folder / name)
 
 
-def passes(folder, tests, seconds=None):
+def passes(folder, tests, *, seconds=None):
     """Whether all tests pass in a copy; one that takes longer has noticed something."""
     command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", *tests]
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
@@ -146,7 +146,8 @@ def main():
     parser.add_argument("--tests", nargs="+", help="files to run (default: those of the room)")
     parser.add_argument("--count", type=int, default=50, help="mutants of the sample")
     arguments = parser.parse_args()
-    tests, console = arguments.tests or tests_of(arguments.room), Console()
+    tests = arguments.tests or tests_of(arguments.room)
+    console = Console()
     files = sorted((ROOT / arguments.room).rglob("*.py")) or [ROOT / arguments.room]
     mutants = [each for file in files for each in mutants_of(file.relative_to(ROOT))]
     chosen = random.Random(0).sample(mutants, min(arguments.count, len(mutants)))
@@ -161,12 +162,12 @@ def main():
         noticed = number = 0
         for file, operator, occurrence in chosen:
             code = (ROOT / file).read_text()
-            mutant = changed(code, operator, occurrence)
+            mutant = changed(code, operator, occurrence=occurrence)
             if mutant == code:  # Cosmic Ray has such
                 continue
             number += 1
             (folder / file).write_text(mutant)
-            survived = passes(folder, tests, longest)
+            survived = passes(folder, tests, seconds=longest)
             (folder / file).write_text(code)
             noticed += not survived
             if survived:

@@ -17,11 +17,13 @@ def _batches(reader, store):
 
 def read(path, *, blueprint=False):
     """All rows of a recording, or of its one layout, by entity, as they were logged."""
-    reader, found = RrdReader(path), {}
+    reader = RrdReader(path)
+    found = {}
     (store,) = reader.blueprints() if blueprint else reader.recordings()
     for chunk, rows in _batches(reader, store):
         for row in rows:
-            times, key = {name: row.pop(name) for name in chunk.timeline_names}, row.pop(_ID)
+            times = {name: row.pop(name) for name in chunk.timeline_names}
+            key = row.pop(_ID)
             values = {name: value for name, value in row.items() if value is not None}
             found.setdefault(chunk.entity_path, []).append((key, (times, values)))
     ordered = {entity: sorted(pairs, key=lambda pair: pair[0]) for entity, pairs in found.items()}

@@ -49,24 +49,24 @@ def coarse_grid(mesh):
 
 def registered_session(name, *, seed=3):
     """The events of two steps of a box, each registered by a method of METHODS."""
-    return _session(name, None, seed)
+    return _session(name, None, seed=seed)
 
 
 def steered_session(name="gradient_descent", *, policy="information", seed=3, **changes):
     """The events of up to three probes of a box that a policy steers; changes: of its settings."""
-    return _session(name, policy, seed, changes)
+    return _session(name, policy, seed=seed, changes=changes)
 
 
 def pushing_session(name="gradient_descent", *, seed=3):
     """Events of three touches that push a box, of which the last two register by themselves."""
     start = {"start": Start(contacts=6), "moves": 0.02}
-    return _session(name, None, seed, probes=3, path=_SIDEWAYS, **start)
+    return _session(name, None, seed=seed, probes=3, path=_SIDEWAYS, **start)
 
 
-def _session(name, policy_name, seed, changes=None, *, probes=2, path=None, **of_start):
+def _session(name, policy_name, *, seed, changes=None, probes=2, path=None, **of_start):
     method = build_method(name, METHODS[name])
     random = np.random.default_rng(seed)
-    start = dataclasses.replace(_start(random, name, method, seed), **of_start)
+    start = dataclasses.replace(_start(random, name, method=method, seed=seed), **of_start)
     recorder = ListRecorder()
     policy = None
     if policy_name is not None:
@@ -104,7 +104,7 @@ def _session(name, policy_name, seed, changes=None, *, probes=2, path=None, **of
             snapshot_interval=6,
         ).hypotheses
         loop.remember(found)
-        recorder.record(Logged(step, "info", f"probe {step}: contact"))
+        recorder.record(Logged(step, "info", text=f"probe {step}: contact"))
         last = step
     recorder.record(SessionEnded(last, "finished"))
     return recorder.events
@@ -112,18 +112,29 @@ def _session(name, policy_name, seed, changes=None, *, probes=2, path=None, **of
 
 def robot_session(name):
     """The same events of a robot: a hand, and a depth and a deformation image before each probe."""
-    random, made = np.random.default_rng(5), []
+    random = np.random.default_rng(5)
+    made = []
     for event in registered_session(name):
         if isinstance(event, Probe):
             for sensor, kind in (("camera", "depth"), ("pad", "deformation")):
                 values = random.integers(0, 900, (6, 8), dtype=np.uint16)
                 camera = np.array([9.0, 9.0, 3.5, 2.5])
-                seen = (values, 0.001, values > 300, camera, np.eye(4))
-                made.append(SensorImage(event.step, sensor, kind, *seen))
+                made.append(
+                    SensorImage(
+                        step=event.step,
+                        sensor=sensor,
+                        kind=kind,
+                        values=values,
+                        unit=0.001,
+                        mask=values > 300,
+                        intrinsics=camera,
+                        world_from_camera=np.eye(4),
+                    )
+                )
         made.append(event)
         if isinstance(event, SessionStarted):
             hand = trimesh.creation.box((0.05, 0.04, 0.03))
-            made.append(RigDescribed(-1, "cabinet", "0a1b", hand))
+            made.append(RigDescribed(-1, "cabinet", source="0a1b", hand=hand))
     return made
 
 
@@ -140,7 +151,7 @@ def write_recording(path, events):
     return path.read_bytes()
 
 
-def _start(random, name, method, seed):
+def _start(random, name, *, method, seed):
     """The start of a session with a box."""
     mesh = trimesh.creation.box(_SIDES)
     return SessionStarted(
@@ -183,4 +194,11 @@ def _probe(random, step):
         known=np.concatenate([surface, surface + 0.01 * normals]),
         known_sdf=np.repeat([0.0, 0.01], 5),
     )
-    return Probe(step, "contact", new, np.eye(4)[None].repeat(2, axis=0), surface, normals)
+    return Probe(
+        step,
+        "contact",
+        new_points=new,
+        gripper_path=np.eye(4)[None].repeat(2, axis=0),
+        contacts=surface,
+        contact_normals=normals,
+    )

@@ -33,17 +33,17 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
     settings_class = AnchoredSettings
 
     def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
-        found = likeliest_push(problem, self.settings, observer)  # stages 1 to 4
+        found = likeliest_push(problem, self.settings, observer=observer)  # stages 1 to 4
         candidates = found.search.spread(found.minima)  # 5
         hypotheses = found.search.choose(candidates)  # 6
         return replace(hypotheses, push_distance=found.distance)
 
     def minima(self, problem: RegistrationProblem) -> Poses:
         """Return the best pose of every basin that a search finds, the likeliest first."""
-        found = Search(problem, self.settings, NullObserver()).minima()
-        return found.poses[basin_bests(problem.sdf, found.poses, _MOST_RIVALS)]
+        found = Search(problem, self.settings, observer=NullObserver()).minima()
+        return found.poses[basin_bests(problem.sdf, found.poses, most=_MOST_RIVALS)]
 
-    def holds(
+    def holds(  # noqa: PLR0917
         self, problem: RegistrationProblem, hypotheses: Hypotheses, object_from_world: FloatArray
     ) -> BoolArray:
         """Return whether the points allow each of poses (N, 4, 4) beside hypotheses: flags (N,).
@@ -52,7 +52,9 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
         points may share cost nothing.
         """
         settings = self.settings
-        search = Search(problem.carried(hypotheses.push_distance), settings, NullObserver())
+        search = Search(
+            problem.carried(hypotheses.push_distance), settings, observer=NullObserver()
+        )
         energy = search.energy.by(noise_model(settings.noise, settings.shared_error))
         best = energy.of(Poses.of(hypotheses.object_from_world[:1]))
         return energy.of(Poses.of(object_from_world)) <= best[0] + settings.limit

@@ -32,8 +32,8 @@ _LIKELY_MODE = 3.0  # nats above the best pose of all: 20 times less likely
 def chosen_hypotheses(
     sdf: SdfGrid,
     poses: Poses,
-    energies: FloatArray,
     *,
+    energies: FloatArray,
     count: int,
     modes: int,
     reach: float,
@@ -46,15 +46,15 @@ def chosen_hypotheses(
     at, evenly from the lowest energy to the highest.
     """
     likely = int((energies <= energies.min() + _LIKELY_MODE).sum())
-    bests = basin_bests(sdf, poses[:likely], min(modes, count))
+    bests = basin_bests(sdf, poses[:likely], most=min(modes, count))
     pool = np.union1d(bests, evenly_spaced(len(energies), most))
     squared = squared_distances(sdf, poses[pool])
-    weights, prices = weights_and_prices(squared, energies[pool], reach, count)
+    weights, prices = weights_and_prices(squared, energies[pool], reach=reach, count=count)
     first = np.searchsorted(pool, bests)
-    return pool[facilities(weights[:, None] * squared, first, count, prices)]
+    return pool[facilities(weights[:, None] * squared, first, count=count, prices=prices)]
 
 
-def filled_up(poses: Poses, chosen: IntArray, count: int) -> IntArray:
+def filled_up(poses: Poses, chosen: IntArray, *, count: int) -> IntArray:
     """Return `count` indices of poses: those chosen, distinct others evenly, then copies of all.
 
     Fewer than `count` are chosen where others have the same surface as chosen ones.
@@ -69,7 +69,7 @@ def filled_up(poses: Poses, chosen: IntArray, count: int) -> IntArray:
 
 
 def weights_and_prices(
-    squared: FloatArray, energies: FloatArray, reach: float, count: int
+    squared: FloatArray, energies: FloatArray, *, reach: float, count: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return the weights w (N,) and prices p (N,), m^2, of candidates whose energies (N,) ascend.
 

@@ -53,7 +53,8 @@ def likelihood_of(noise: NoiseModel, known: int) -> Likelihood:
     """Return tables for so many known points."""
     step = noise.sigmas[0] / _ROWS_PER_LEVEL
     rows = int(_BEYOND * noise.sigmas[-1] / step) + 2
-    sizes, sigmas = step * np.arange(rows, dtype=np.float64), np.array(noise.sigmas)
+    sizes = step * np.arange(rows, dtype=np.float64)
+    sigmas = np.array(noise.sigmas)
     costs = replace(noise, shared=0.0).costs(sizes)
     peak = (1.0 - SHARE) / (math.sqrt(2.0 * math.pi) * sigmas[0])
     foreign = SHARE / EXTENT / (peak + SHARE / EXTENT)
@@ -83,11 +84,15 @@ class Scratch(NamedTuple):
 class Energy:
     """The energy of poses by the points of a problem."""
 
-    def __init__(self, problem: RegistrationProblem, known: KnownPoints, noise: NoiseModel) -> None:
+    def __init__(
+        self, problem: RegistrationProblem, known: KnownPoints, *, noise: NoiseModel
+    ) -> None:
         """known: the problem's points, in the order in which they are looked up."""
-        settings, side = CostSettings(penetration_tolerance=0.0), problem.free_resolution
-        self._cost = CompiledCost(problem.sdf, known, settings, free_resolution=side)
-        self._sdf, self._count = problem.sdf, len(known.known)
+        settings = CostSettings(penetration_tolerance=0.0)
+        side = problem.free_resolution
+        self._cost = CompiledCost(problem.sdf, known, settings=settings, free_resolution=side)
+        self._sdf = problem.sdf
+        self._count = len(known.known)
         self._set(noise)
 
     def _set(self, noise: NoiseModel) -> None:
@@ -103,7 +108,7 @@ class Energy:
     def scratch(self) -> Scratch:
         """Return scratch of one thread."""
         near = near_points_for(self.model.free.tree, 1)
-        return Scratch(near, scratch(12), scratch(_LEVELS))
+        return Scratch(near, scratch(12), sums=scratch(_LEVELS))
 
     def of(self, poses: Poses) -> FloatArray:
         """Return energies (B,) of poses."""
@@ -112,7 +117,7 @@ class Energy:
         def run(first: int, last: int, work: Any) -> None:
             energies_of(self.model, self.likelihood, poses.numbers, energies, first, last, work)
 
-        parallel_for(run, len(poses), self.scratch, least=50)
+        parallel_for(run, len(poses), scratch=self.scratch, least=50)
         return energies
 
 
@@ -132,7 +137,9 @@ def known_energy(model, likelihood, pose, limit, sums):
 
     sums (K,) become the posterior weights of the levels.
     """
-    field, known, levels = model.field, model.known, np.uint64(_LEVELS)
+    field = model.field
+    known = model.known
+    levels = np.uint64(_LEVELS)
     costs, count = likelihood.costs, known.shape[1]
     for k in range(levels):
         sums[k] = 0.0
@@ -173,7 +180,9 @@ def _row(likelihood, residual):
 def known_slope(likelihood, residual, weights):
     """Return the derivative of the energy by half of a squared residual; weights: of the levels."""
     at, part = _row(likelihood, residual)
-    slopes, levels, total = likelihood.slopes, np.uint64(_LEVELS), 0.0
+    slopes = likelihood.slopes
+    levels = np.uint64(_LEVELS)
+    total = 0.0
     for k in range(levels):
         low = slopes[at + k]
         total += weights[k] * (low + part * (slopes[at + levels + k] - low))
@@ -210,7 +219,9 @@ def energy_below(model, likelihood, pose, known, limit, work):
 
     It is infinite above a limit. Also return the sum of the costs of the latter.
     """
-    occupied, table, costs = model.occupied, model.field.table, 0.0
+    occupied = model.occupied
+    table = model.field.table
+    costs = 0.0
     for n in range(occupied.shape[1]):
         s = distance_at(model.field, pose, occupied[0, n], occupied[1, n], occupied[2, n])
         costs += _depth_cost(likelihood, max(s + model.alpha, 0.0))

@@ -75,18 +75,29 @@ class Fit(NamedTuple):
     twist: FloatArray  # (6,)
 
 
-def fitted(energy: Energy, twists: Twists, poses: Poses, steps: int) -> Poses:
+def fitted(energy: Energy, twists: Twists, *, poses: Poses, steps: int) -> Poses:
     """Return poses after at most so many steps that lower their energies."""
-    result, d = np.array(poses.numbers), len(twists.basis)
+    result = np.array(poses.numbers)
+    d = len(twists.basis)
 
     def new_scratch() -> Fit:
-        normal, right, factor = scratch(d, d), scratch(d), scratch(d, d)
-        return Fit(energy.scratch(), scratch(8, 6), normal, right, factor, scratch(d), scratch(6))
+        normal = scratch(d, d)
+        right = scratch(d)
+        factor = scratch(d, d)
+        return Fit(
+            energy.scratch(),
+            scratch(8, 6),
+            normal=normal,
+            right=right,
+            factor=factor,
+            row=scratch(d),
+            twist=scratch(6),
+        )
 
     def run(first: int, last: int, fit: Any) -> None:
         fit_poses(energy.model, energy.likelihood, twists, result, steps, first, last, fit)
 
-    parallel_for(run, len(result), new_scratch, least=8)
+    parallel_for(run, len(result), scratch=new_scratch, least=8)
     return Poses(result)
 
 
@@ -135,7 +146,9 @@ def _fitted(model, likelihood, twists, pose, steps, fit):
 @inner
 def _linearise(model, likelihood, twists, pose, costs, fit):
     """Fill the normal equations at a pose; costs: of free and occupied points, see energy_below."""
-    field, sums, work = model.field, fit.sums, fit.work
+    field = model.field
+    sums = fit.sums
+    work = fit.work
     for i in range(7):
         for j in range(6):
             sums[i, j] = 0.0
@@ -183,7 +196,9 @@ def _add(sums, pivot, pose, point, looked_up, residual, weight):
 @inner
 def _restrict(twists, fit):
     """Fill the normal equations from sums over all twists: B N B^T and B r."""
-    basis, sums, product = twists.basis, fit.sums, fit.sums[7]
+    basis = twists.basis
+    sums = fit.sums
+    product = fit.sums[7]
     for i in range(6):
         for j in range(i):
             sums[j, i] = sums[i, j]

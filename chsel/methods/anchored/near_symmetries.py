@@ -47,12 +47,12 @@ def _near_symmetries(sdf: SdfGrid) -> FloatArray:
     turns = random_rotations(StreamKey(0, 0).stream(Purpose.MESH_SAMPLES, 1), _TURNS)
     turned = turned_about(centre, turns)
     best = np.argsort(energy.of(turned), kind="stable")[:_FITTED]
-    fits = fitted(energy, twists_of(SE3Space(), centre), turned[best], _STEPS)
-    distances = outline_distances_to(sdf, fits, identity)
+    fits = fitted(energy, twists_of(SE3Space(), centre), poses=turned[best], steps=_STEPS)
+    distances = outline_distances_to(sdf, fits, other=identity)
     order = np.argsort(distances, kind="stable")
     order = order[distances[order] <= _ALIKE * sdf.diameter]
     poses = Poses.joined([identity, fits[order]])
-    return poses[basin_bests(sdf, poses, _MOST + 1, np.inf)[1:]].matrices
+    return poses[basin_bests(sdf, poses, most=_MOST + 1, distance=np.inf)[1:]].matrices
 
 
 def energy_in_itself(sdf: SdfGrid, noise: float) -> Energy:
@@ -62,14 +62,14 @@ def energy_in_itself(sdf: SdfGrid, noise: float) -> Energy:
     """
     surface = KnownPoints(known=outline_in_object(sdf))
     problem = RegistrationProblem(
-        sdf,
-        surface,
+        sdf=sdf,
+        points=surface,
         initial_set=np.eye(4)[None],
         workspace=Workspace(tuple(sdf.bounds[0]), tuple(sdf.bounds[1])),
         free_resolution=sdf.resolution,
         key=StreamKey(0, 0),
     )
-    return Energy(problem, surface, noise_model(noise))
+    return Energy(problem, surface, noise=noise_model(noise))
 
 
 def turned_about(centre: FloatArray, turns: FloatArray) -> Poses:

@@ -35,17 +35,21 @@ def pose_bound(sdf: SdfGrid, poses: Poses) -> tuple[float, float]:
     turns = product(poses.rotations[0], back)  # of the object, in its frame
     angles = rotation_angle(turns)
     large = angles > _SMALL
-    angles[large] = _left(sdf, centre, turns[large])
+    angles[large] = _left(sdf, centre, turns=turns[large])
     return float(away.max()), float(angles.max())
 
 
-def _left(sdf: SdfGrid, centre: FloatArray, turns: FloatArray) -> FloatArray:
+def _left(sdf: SdfGrid, centre: FloatArray, *, turns: FloatArray) -> FloatArray:
     """Return angles (B,), radians, that turns (B, 3, 3) have left after their nearest symmetry."""
     angles = rotation_angle(turns)
     if len(turns) == 0:
         return angles
     energy = energy_in_itself(sdf, _SOFT * sdf.diameter)
-    fits = fitted(energy, twists_of(SE3Space(), centre), turned_about(centre, turns), _STEPS)
-    alike = outline_distances_to(sdf, fits, Poses.of(np.eye(4)[None])) <= SYMMETRIC * sdf.diameter
+    fits = fitted(
+        energy, twists_of(SE3Space(), centre), poses=turned_about(centre, turns), steps=_STEPS
+    )
+    alike = (
+        outline_distances_to(sdf, fits, other=Poses.of(np.eye(4)[None])) <= SYMMETRIC * sdf.diameter
+    )
     left = rotation_angle(product(turns, np.swapaxes(fits.rotations, 1, 2)))
     return np.where(alike, np.minimum(left, angles), angles)

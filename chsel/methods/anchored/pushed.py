@@ -29,20 +29,21 @@ class PushSearch(NamedTuple):
 
 
 def likeliest_push(
-    problem: RegistrationProblem, settings: AnchoredSettings, observer: Observer
+    problem: RegistrationProblem, settings: AnchoredSettings, *, observer: Observer
 ) -> PushSearch:
     """Return the search for the likeliest distance of a push; 0 if the object may stand still."""
-    standing = _searched(problem, 0.0, settings, observer)
+    standing = _searched(problem, 0.0, settings=settings, observer=observer)
     pushes = problem.pushes
     if pushes is None or len(pushes.directions) < _LEAST_PUSHES:
         return standing
-    moved = _lowest_above_zero(problem, pushes, settings, observer)
+    moved = _lowest_above_zero(problem, pushes, settings=settings, observer=observer)
     return moved if moved.lowest < standing.lowest - _LIKELIER else standing
 
 
 def _lowest_above_zero(
     problem: RegistrationProblem,
     pushes: Pushes,
+    *,
     settings: AnchoredSettings,
     observer: Observer,
 ) -> PushSearch:
@@ -52,22 +53,25 @@ def _lowest_above_zero(
     half a step, then a quarter away, and the best one's minima are only fitted again.
     """
     _, step, *others = pushes.distances
-    searches = [_searched(problem, distance, settings, observer) for distance in (step, *others)]
+    searches = [
+        _searched(problem, distance, settings=settings, observer=observer)
+        for distance in (step, *others)
+    ]
     best = min(searches, key=lambda each: each.lowest)
     for _ in range(_HALVINGS):
         step *= 0.5
         nearby = [best]
         for distance in (best.distance - step, best.distance + step):
             if distance <= pushes.largest:
-                search = Search(problem.carried(distance), settings, observer)
+                search = Search(problem.carried(distance), settings, observer=observer)
                 minima = search.refined(search.rated(best.minima.poses))
-                nearby.append(PushSearch(distance, search, minima))
+                nearby.append(PushSearch(distance, search, minima=minima))
         best = min(nearby, key=lambda each: each.lowest)
     return best
 
 
 def _searched(
-    problem: RegistrationProblem, distance: float, settings: AnchoredSettings, observer: Observer
+    problem: RegistrationProblem, distance: float, *, settings: AnchoredSettings, observer: Observer
 ) -> PushSearch:
-    search = Search(problem.carried(distance), settings, observer)
-    return PushSearch(distance, search, search.minima())
+    search = Search(problem.carried(distance), settings, observer=observer)
+    return PushSearch(distance, search, minima=search.minima())

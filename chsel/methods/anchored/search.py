@@ -60,7 +60,7 @@ class Search:
     """One registration by the stages of docs/anchored.md."""
 
     def __init__(
-        self, problem: RegistrationProblem, settings: AnchoredSettings, observer: Observer
+        self, problem: RegistrationProblem, settings: AnchoredSettings, *, observer: Observer
     ) -> None:
         self._problem = problem
         self._settings = settings
@@ -70,12 +70,12 @@ class Search:
         contacts = most_informative_first(problem.points)
         most = self._effort.contacts
         self._known = replace(contacts, known=contacts.known[:most], known_sdf=contacts.sdf[:most])
-        bounds = origin_bounds(problem.workspace, self._space, settings.anchors.margin)
+        bounds = origin_bounds(problem.workspace, self._space, margin=settings.anchors.margin)
         centre = object_centre(problem.sdf)
         self._twists = twists_of(self._space, centre)
-        self._stride = stride_of(self._space, centre, bounds)
+        self._stride = stride_of(self._space, centre, bounds=bounds)
         self._walks = 0  # done so far, each with a random stream of its own
-        self.energy = Energy(problem, self._known, noise_model(settings.noise))
+        self.energy = Energy(problem, self._known, noise=noise_model(settings.noise))
 
     def minima(self) -> RatedPoses:
         """Return the minima of all basins that stages 1 to 4 find, the lowest first.
@@ -128,7 +128,9 @@ class Search:
             softness=_ROUGH_SOFTNESS,
             wrong=_ROUGH_WRONG,
         )
-        poses = fitted(self.energy.by(rough), self._twists, starts, self._effort.first_steps)
+        poses = fitted(
+            self.energy.by(rough), self._twists, poses=starts, steps=self._effort.first_steps
+        )
         fits = self.refined(self.rated(poses))
         self._show("fit", fits)
         return fits
@@ -141,7 +143,7 @@ class Search:
         """Return all poses, the better part fitted where that lowers the energy, lowest first."""
         count = self._effort.refined
         before = rated.chosen(slice(count))
-        poses = fitted(self.energy, self._twists, before.poses, self._effort.steps)
+        poses = fitted(self.energy, self._twists, poses=before.poses, steps=self._effort.steps)
         after = RatedPoses(poses, self.energy.of(poses))
         lower = after.energies < before.energies
         others = rated.chosen(slice(count, None))
@@ -152,7 +154,7 @@ class Search:
 
         The best pose of each basin walks, then the lowest of the others if there are fewer basins.
         """
-        walkers = basin_bests(self._problem.sdf, rated.poses, most)
+        walkers = basin_bests(self._problem.sdf, rated.poses, most=most)
         others = np.setdiff1d(np.arange(len(rated.energies)), walkers)
         room = most - len(walkers)
         walkers = np.concatenate([walkers, others[:room]])
@@ -168,7 +170,7 @@ class Search:
         sdf = self._problem.sdf
         symmetries = near_symmetries(sdf)
         if len(symmetries) > 0:
-            best = rated.poses[basin_bests(sdf, rated.poses, self._effort.twins)]
+            best = rated.poses[basin_bests(sdf, rated.poses, most=self._effort.twins)]
             turns = symmetries[:, None, :3, :3]
             shifts = symmetries[:, None, :3, 3]
             moved = compose(
@@ -190,7 +192,7 @@ class Search:
         chains = max(effort.chains, -(-wanted // effort.states))
         minima = minima.chosen(minima.energies <= limit)
         likely = minima.chosen(minima.energies <= minima.energies.min() + _LIKELY)
-        starts = np.resize(farthest_poses(self._problem.sdf, likely.poses, chains), chains)
+        starts = np.resize(farthest_poses(self._problem.sdf, likely.poses, count=chains), chains)
         walks = self._walk(
             likely.chosen(starts), moves=effort.moves, floor=limit, states=effort.states
         )
@@ -210,31 +212,45 @@ class Search:
         chosen = chosen_hypotheses(
             self._problem.sdf,
             poses,
-            candidates.energies,
+            energies=candidates.energies,
             count=count,
             modes=settings.modes,
             reach=settings.reach,
             most=self._effort.pool,
         )
-        chosen = filled_up(poses, chosen, count)
+        chosen = filled_up(poses, chosen, count=count)
         measure = measure_named(settings.archive.measure, planar=settings.plane is not None)
         vectors = self._space.encode(poses)
-        offered = Evaluated(vectors, candidates.energies, measure.values(self._space, vectors))
+        offered = Evaluated(
+            vectors, candidates.energies, measures=measure.values(self._space, vectors)
+        )
         known = len(self._problem.points.known)
-        archive = sized_archive(offered, measure, settings.archive, known, self._space.dimension)
-        offers = archive.add(vectors, -candidates.energies, offered.measures)
+        archive = sized_archive(
+            offered,
+            measure,
+            settings=settings.archive,
+            known_count=known,
+            dimension=self._space.dimension,
+        )
+        offers = archive.add(vectors, -candidates.energies, measures=offered.measures)
         self._observer.snapshot(archive.snapshot(0, 0))
         last = archive.snapshot(0, 0)  # another one: an observer may change what it gets
         elites = self._space.poses(last.solutions)
         hypotheses = self._space.poses(vectors[chosen])
         energies = self.energy.of(hypotheses)
-        result = ranked(hypotheses.matrices, energies, offers.cells[chosen], elites.matrices, last)
+        result = ranked(
+            hypotheses.matrices,
+            energies,
+            cells=offers.cells[chosen],
+            elites=elites.matrices,
+            archive=last,
+        )
         return replace(result, candidates=poses.matrices)
 
     @cached_property
     def _sampler(self) -> AnchorSampler:
         anchors = self._settings.anchors
-        return AnchorSampler(self._problem, self._known, self._space, anchors)
+        return AnchorSampler(self._problem, self._known, space=self._space, settings=anchors)
 
     def _previous(self) -> Poses:
         """Return the best poses of E_0 and E_l."""
@@ -258,8 +274,8 @@ class Search:
         return has_new_mode(
             self._problem.sdf,
             before.chosen(before.energies <= limit).poses,
-            new.chosen(new.energies <= limit).poses,
-            len(self._problem.initial_set),
+            new=new.chosen(new.energies <= limit).poses,
+            count=len(self._problem.initial_set),
         )
 
     def _walk(self, starts: RatedPoses, *, moves: int, floor: float, states: int = 0) -> Chains:
@@ -268,8 +284,8 @@ class Search:
         return walked(
             self.energy,
             self._stride,
-            starts.poses,
-            starts.energies,
+            poses=starts.poses,
+            energies=starts.energies,
             floor=floor,
             moves=moves,
             stream=stream,

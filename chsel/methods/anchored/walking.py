@@ -56,12 +56,14 @@ class Stride(NamedTuple):
 
 
 def stride_of(
-    space: SearchSpace, pivot: FloatArray, bounds: tuple[FloatArray, FloatArray]
+    space: SearchSpace, pivot: FloatArray, *, bounds: tuple[FloatArray, FloatArray]
 ) -> Stride:
     """Return moves in a space, about a point (3,) of the object or a contact."""
     planar = isinstance(space, SE2Space)
     axis = triple(space.axis) if isinstance(space, SE2Space) else (0.0, 0.0, 0.0)
-    return Stride(planar, axis, triple(pivot), triple(bounds[0]), triple(bounds[1]))
+    return Stride(
+        planar, axis, pivot=triple(pivot), lower=triple(bounds[0]), upper=triple(bounds[1])
+    )
 
 
 class Chains(NamedTuple):
@@ -76,6 +78,7 @@ class Chains(NamedTuple):
 def walked(
     energy: Energy,
     stride: Stride,
+    *,
     poses: Poses,
     energies: FloatArray,
     floor: float,
@@ -87,9 +90,15 @@ def walked(
 
     floor: the energy that they come down to, or stay below, see walk_below. kept: states of each.
     """
-    count, model, likelihood = len(poses), energy.model, energy.likelihood
-    states = np.zeros((count, kept, 12)), np.full((count, kept), np.inf)
-    chains = Chains(np.array(poses.numbers), np.array(energies), *states)
+    count = len(poses)
+    model = energy.model
+    likelihood = energy.likelihood
+    chains = Chains(
+        np.array(poses.numbers),
+        np.array(energies),
+        kept=np.zeros((count, kept, 12)),
+        kept_energies=np.full((count, kept), np.inf),
+    )
 
     def new_scratch() -> tuple[Scratch, Any]:
         return energy.scratch(), scratch(_MOVES * _DRAWS + 16, dtype=np.float32)
@@ -97,7 +106,7 @@ def walked(
     def run(first: int, last: int, work: Any) -> None:
         walk_below(model, likelihood, stride, floor, chains, stream, moves, first, last, *work)
 
-    parallel_for(run, count, new_scratch, least=2)
+    parallel_for(run, count, scratch=new_scratch, least=2)
     return chains
 
 
@@ -110,7 +119,9 @@ def walk_below(model, likelihood, stride, floor, chains, stream, moves, first, l
     """
     keep = chains.kept.shape[1]
     for n in range(first, last):
-        pose, energy, size = pose_at(chains.poses, n), chains.energies[n], _FIRST
+        pose = pose_at(chains.poses, n)
+        energy = chains.energies[n]
+        size = _FIRST
         slack, done = -1.0, 0
         for m in range(moves):
             if keep == 0 and energy <= floor:
@@ -158,7 +169,9 @@ def _slack_for(size):
 def _proposed(model, stride, pose, size, draw):
     """Return a pose near by. draw (9,): factor of the size, two choices, a turn, and a shift."""
     size *= _SMALLEST * exp(_RANGE * draw[0])
-    shift, turn, known = size * _DEVIATION, size * _DEVIATION * _PER_METRE, model.known
+    shift = size * _DEVIATION
+    turn = size * _DEVIATION * _PER_METRE
+    known = model.known
     a, b, c = turn * (draw[3] - 0.5), turn * (draw[4] - 0.5), turn * (draw[5] - 0.5)
     u, v, w = shift * (draw[6] - 0.5), shift * (draw[7] - 0.5), shift * (draw[8] - 0.5)
     if stride.planar:

@@ -22,7 +22,7 @@ class Bridge:
         """Add the free space of a sensor_msgs/Image: 32FC1 in metres, or 16UC1 in millimetres."""
         size = image.width, image.height
         data, order = bytes(image.data), bool(image.is_bigendian)
-        values = pixel_rows(data, image.encoding, size, image.step, big_endian=order)
+        values = pixel_rows(data, image.encoding, size=size, step=image.step, big_endian=order)
         self.session.add(
             depth=values * (0.001 if values.dtype == np.uint16 else 1.0),
             camera=np.reshape(info.k, (3, 3)),

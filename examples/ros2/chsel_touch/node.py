@@ -24,7 +24,8 @@ class TouchNode(Node):
             for name, default in (("mesh", ""), ("record", ""), ("world", "world"))
         )
         self.session = chsel.Session(mesh, record=record or None)
-        self.bridge, self.seen = Bridge(self.session, self.transform_to_world), None
+        self.bridge = Bridge(self.session, self.transform_to_world)
+        self.seen = None
         self.buffer = Buffer()
         self.listener = TransformListener(self.buffer, self)
         self.poses = self.create_publisher(PoseArray, "poses", 1)
@@ -36,7 +37,8 @@ class TouchNode(Node):
         self.create_service(Trigger, "look", self.look)
 
     def transform_to_world(self, header):
-        stamp, wait = Time.from_msg(header.stamp), Duration(seconds=0.5)
+        stamp = Time.from_msg(header.stamp)
+        wait = Duration(seconds=0.5)
         return self.buffer.lookup_transform(self.world, header.frame_id, stamp, wait).transform
 
     def contact(self, message):

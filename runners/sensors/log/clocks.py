@@ -53,7 +53,7 @@ class Clocks:
         for topic in self._times:
             log_times, stamps = (times[self.of(topic)[1] != 0] for times in self.of(topic))
             if len(stamps):
-                offsets = clock_offsets(log_times, stamps, limit)
+                offsets = clock_offsets(log_times, stamps, limit=limit)
                 medians[topic] = offsets[0]
                 if len(offsets) > 1:
                     several[topic] = offsets
@@ -111,7 +111,7 @@ class ClockCorrection:
 
     warnings: tuple[str, ...] = ()  # what a user should know of the clocks
 
-    def times(self, topic: str, log_times: Any, stamps: Any) -> IntArray:
+    def times(self, topic: str, log_times: Any, *, stamps: Any) -> IntArray:
         """Return when messages (N,) were true, nanoseconds: by their stamps, where possible."""
         logged, sent = np.asarray(log_times, np.int64), np.asarray(stamps, np.int64)
         if self.by_log:
@@ -125,10 +125,10 @@ class ClockCorrection:
 
     def time(self, received: Received) -> int:
         """Return when one message was true, nanoseconds."""
-        return int(self.times(received.topic, received.log_time, received.stamp or 0))
+        return int(self.times(received.topic, received.log_time, stamps=received.stamp or 0))
 
 
-def clock_offsets(log_times: IntArray, stamps: IntArray, limit: int) -> list[int]:
+def clock_offsets(log_times: IntArray, stamps: IntArray, *, limit: int) -> list[int]:
     """Return the offsets of stamps (N,) against the log's times (N,), nanoseconds, N > 0.
 
     Several if the sender's clock was set or started again, or senders have several, by more than
@@ -172,7 +172,8 @@ def largest_step(log_times: IntArray, stamps: IntArray) -> float:
     if len(changes) == 0:
         return 0.0
     last = _STEADY - 1 + int(changes.argmax())  # before the step
-    before, after = offsets[last + 1 - _STEADY : last + 1], offsets[last + 1 : last + 1 + _STEADY]
+    before = offsets[last + 1 - _STEADY : last + 1]
+    after = offsets[last + 1 : last + 1 + _STEADY]
     step = float(np.median(after) - np.median(before))
     varies = max(float(np.ptp(before)), float(np.ptp(after)))
     return step if abs(step) > max(_LEAST_STEP, 3.0 * varies) else 0.0

@@ -48,13 +48,13 @@ Read = Callable[[Any, str], Content]
 """From a parsed message and its frame to its content."""
 
 
-def decoder(name: str, encoding: str, definition: str | None = None) -> Decode:
+def decoder(name: str, encoding: str, *, definition: str | None = None) -> Decode:
     """Decodes messages of a schema; all to the same UnusableMessage if it is not read.
 
     definition: of a ROS 2 message in the file, by which it is decoded; by default that of ROS 2.
     """
     try:
-        parse, read = _reader(name, encoding, definition)
+        parse, read = _reader(name, encoding, definition=definition)
     except UnusableMessage as error:
         unread: list[Decoded] = [(None, error)]
         return lambda data: iter(unread)
@@ -67,18 +67,18 @@ def decoder(name: str, encoding: str, definition: str | None = None) -> Decode:
         if encoding == "cdr" and data.startswith(_ZSTD):
             yield None, _COMPRESSED
             return
-        message = _checked(name, parse, data)
+        message = _checked(name, parse, given=data)
         if isinstance(message, UnusableMessage):
             yield None, message
             return
         for part in getattr(message, "transforms", [message]):
-            found = _checked(name, decoded, part)
+            found = _checked(name, decoded, given=part)
             yield (None, found) if isinstance(found, UnusableMessage) else found
 
     return decode
 
 
-def _checked(name: str, read: Callable[[Any], Any], given: Any) -> Any:
+def _checked(name: str, read: Callable[[Any], Any], *, given: Any) -> Any:
     """Return what `read` returns, or its exception as UnusableMessage; libraries raise anything."""
     try:
         return read(given)
@@ -90,7 +90,7 @@ def _checked(name: str, read: Callable[[Any], Any], given: Any) -> Any:
 
 
 def _reader(
-    name: str, encoding: str, definition: str | None
+    name: str, encoding: str, *, definition: str | None
 ) -> tuple[Callable[[bytes], Any], Read]:
     """Return what parses messages of a schema, and what reads their content."""
     short = name.replace("/msg/", "/")
@@ -127,7 +127,8 @@ def _header(message: Any) -> tuple[int | None, str]:
         time, frame = message.header.stamp, message.header.frame_id
         stamp = time.sec * _NANOSECONDS + time.nanosec
     elif hasattr(message, "timestamp"):  # of Foxglove
-        stamp, frame = message.timestamp.ToNanoseconds(), getattr(message, "frame_id", "")
+        stamp = message.timestamp.ToNanoseconds()
+        frame = getattr(message, "frame_id", "")
     else:
         return None, ""
     if stamp not in range(_END_OF_TIME):
@@ -144,8 +145,8 @@ def _image(message: Any, frame: str) -> ImageMessage:
     values = pixel_rows(
         message.data,
         message.encoding,
-        (message.width, message.height),
-        message.step,
+        size=(message.width, message.height),
+        step=message.step,
         big_endian=bool(getattr(message, "is_bigendian", 0)),
     )
     return ImageMessage(frame, values)
@@ -173,7 +174,7 @@ def _ros2_camera(message: Any, _: str) -> CameraInfoMessage:
         )
 
     rectified = None if info.rectified is None else sent(info.rectified)
-    return CameraInfoMessage(sent(info.camera), info.distorted, rectified)
+    return CameraInfoMessage(sent(info.camera), info.distorted, rectified=rectified)
 
 
 def _foxglove_camera(message: Any, _: str) -> CameraInfoMessage:
@@ -189,7 +190,9 @@ def _camera(width: int, height: int, *, k: Any, p: Any, d: Any) -> CameraInfoMes
     if len(p) == 12 and p[0] != 0.0:
         with suppress(UnusableMessage):  # who rectifies no images may leave anything there
             rectified = _pinhole("P", [*p[:3], *p[4:7], *p[8:11]], width=width, height=height)
-    return CameraInfoMessage(_pinhole("K", k, width=width, height=height), any(d), rectified)
+    return CameraInfoMessage(
+        _pinhole("K", k, width=width, height=height), any(d), rectified=rectified
+    )
 
 
 def _pinhole(name: str, numbers: Any, *, width: int, height: int) -> PinholeCamera:
@@ -207,7 +210,7 @@ def _ros2_cloud(message: Any, frame: str) -> CloudMessage:
     points = packed_points(
         message.data,
         {part.name: (part.offset, part.datatype) for part in message.fields},
-        message.point_step,
+        stride=message.point_step,
         size=(message.width, message.height),
         row=message.row_step,
         big_endian=message.is_bigendian,
@@ -219,7 +222,7 @@ def _foxglove_cloud(message: Any, frame: str) -> CloudMessage:
     named = {field.name: (field.offset, field.type) for field in message.fields}
     stride, data = message.point_stride, message.data
     count = len(data) // stride
-    points = packed_points(data, named, stride, size=(count, 1), row=count * stride)
+    points = packed_points(data, named, stride=stride, size=(count, 1), row=count * stride)
     if message.HasField("pose"):
         points = apply(rigid(message.pose.position, message.pose.orientation), points)
     return CloudMessage(frame, points)
@@ -231,11 +234,15 @@ def _transform(message: Any, frame: str) -> TransformMessage:
     child = _frame_name(message.child_frame_id)
     if not parent or not child:
         raise UnusableMessage("a transform lacks the name of a frame")
-    return TransformMessage(parent, child, rigid(moved.translation, moved.rotation))
+    return TransformMessage(
+        parent, child, parent_from_child=rigid(moved.translation, moved.rotation)
+    )
 
 
 def _pose(message: Any, frame: str) -> TransformMessage:
-    return TransformMessage(frame, "", rigid(message.pose.position, message.pose.orientation))
+    return TransformMessage(
+        frame, "", parent_from_child=rigid(message.pose.position, message.pose.orientation)
+    )
 
 
 def _poses(message: Any, frame: str) -> CloudMessage:
@@ -250,7 +257,7 @@ def _wrench(message: Any, frame: str) -> WrenchMessage:
     force, torque = _positions([message.wrench.force, message.wrench.torque])
     if not np.isfinite([force, torque]).all():
         raise UnusableMessage("a force or torque is not finite")
-    return WrenchMessage(frame, force, torque)
+    return WrenchMessage(frame, force, torque=torque)
 
 
 def _joints(message: Any, _: str) -> Joints:
@@ -304,8 +311,8 @@ def _positions(points: Iterable[Any]) -> FloatArray:
 def packed_points(
     data: bytes,
     fields: Mapping[str, tuple[int, int]],
-    stride: int,
     *,
+    stride: int,
     size: tuple[int, int],
     row: int,
     big_endian: bool = False,

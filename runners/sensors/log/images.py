@@ -20,7 +20,7 @@ _FORMATS = {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF"}
 
 
 def pixel_rows(
-    data: bytes, encoding: str, size: tuple[int, int], step: int, *, big_endian: bool = False
+    data: bytes, encoding: str, *, size: tuple[int, int], step: int, big_endian: bool = False
 ) -> np.ndarray:
     """Return values (H, W), uint16 or float32, of rows of `step` bytes.
 
@@ -94,7 +94,7 @@ def read_image(path: Path, where: str) -> np.ndarray:
     a file that is missing, broken, or of several channels.
     """
     kind = path.suffix.lower()
-    refuse_special_file(f"{where} {path}", path, SessionError)
+    refuse_special_file(f"{where} {path}", path, error=SessionError)
     try:
         if kind == ".npy":
             values = np.load(path, allow_pickle=False)

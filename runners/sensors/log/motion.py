@@ -66,6 +66,7 @@ class CheckedMotion:
 def check_motion(
     times: IntArray,
     distances: Distances,
+    *,
     limits: MotionLimits,
     blank: BoolArray | None = None,
 ) -> CheckedMotion:
@@ -76,29 +77,39 @@ def check_motion(
     """
     outliers = np.zeros(len(times), dtype=bool)
     every = np.arange(len(times))
-    if blank is not None and not _reachable(times, distances, every[:-1], every[1:], limits).all():
+    if (
+        blank is not None
+        and not _reachable(
+            times, distances, first=every[:-1], second=every[1:], limits=limits
+        ).all()
+    ):
         outliers |= blank
     left = np.flatnonzero(~outliers)
     alone, disputed = np.zeros((2, len(times)), dtype=bool)
-    alone[left], disputed[left] = _there_and_back(times, distances, left)
+    alone[left], disputed[left] = _there_and_back(times, distances, left=left)
     outliers |= alone
     left = np.flatnonzero(~outliers & ~disputed)
-    too_fast = ~_reachable(times, distances, left[:-1], left[1:], limits)
+    too_fast = ~_reachable(times, distances, first=left[:-1], second=left[1:], limits=limits)
     if too_fast.any():
         starts = np.flatnonzero(np.append(True, too_fast))
-        tracks = _tracks(times, distances, left, starts, limits)
-        _choose(tracks, distances, left, outliers, disputed)
+        tracks = _tracks(times, distances, left=left, starts=starts, limits=limits)
+        _choose(tracks, distances, left=left, outliers=outliers, disputed=disputed)
     kept = ~outliers & ~disputed
     chosen = np.flatnonzero(kept)
     between = np.cumsum(disputed)[chosen]
-    breaks = ~_reachable(times, distances, chosen[:-1], chosen[1:], limits)
+    breaks = ~_reachable(times, distances, first=chosen[:-1], second=chosen[1:], limits=limits)
     jumps = np.zeros(len(times), dtype=bool)
     jumps[chosen[1:]] = breaks | (np.diff(between) > 0)
-    return CheckedMotion(kept, jumps, outliers, disputed)
+    return CheckedMotion(kept, jumps, outliers=outliers, disputed=disputed)
 
 
 def _reachable(
-    times: IntArray, distances: Distances, first: IntArray, second: IntArray, limits: MotionLimits
+    times: IntArray,
+    distances: Distances,
+    *,
+    first: IntArray,
+    second: IntArray,
+    limits: MotionLimits,
 ) -> BoolArray:
     """Return whether (N,) the way between samples is possible in the time between them."""
     seconds = np.abs(times[second] - times[first]) / _NANOSECONDS
@@ -108,7 +119,7 @@ def _reachable(
 
 
 def _there_and_back(
-    times: IntArray, distances: Distances, left: IntArray
+    times: IntArray, distances: Distances, *, left: IntArray
 ) -> tuple[BoolArray, BoolArray]:
     """Return which of samples `left` (L,) are off their neighbours' way; and which alternate."""
     outliers, disputed = np.zeros((2, len(left)), dtype=bool)
@@ -117,7 +128,7 @@ def _there_and_back(
     seconds = np.diff(times[left]) / _NANOSECONDS
     steps = (distances(left[:-1], left[1:]) / _STEP).max(axis=1)
     least = np.minimum(steps[:-1], steps[1:])
-    back = (least > 1.0) & _is_back(distances, left[:-2], left[2:], least)
+    back = (least > 1.0) & _is_back(distances, left[:-2], after=left[2:], steps=least)
     # A robot that turns round was fast before and is fast after it, and does not turn at once.
     beside = np.concatenate([[np.inf], steps, [np.inf]])
     slow = np.minimum(beside[:-3], beside[3:]) < _SLOW * least
@@ -148,7 +159,7 @@ def _short_visits(
     visits = (least > 1.0) & (between < _SLOW * least)
     # A robot that turns round may take so many intervals for it.
     visits &= least > _SUDDEN * length * seconds[:-length] * seconds[length:]
-    visits &= _is_back(distances, left[: -length - 1], left[length + 1 :], least)
+    visits &= _is_back(distances, left[: -length - 1], after=left[length + 1 :], steps=least)
     found = np.zeros(len(left), dtype=bool)
     for first in np.flatnonzero(visits).tolist():
         found[first + 1 : first + 1 + length] = True
@@ -156,7 +167,7 @@ def _short_visits(
 
 
 def _is_back(
-    distances: Distances, before: IntArray, after: IntArray, steps: FloatArray
+    distances: Distances, before: IntArray, *, after: IntArray, steps: FloatArray
 ) -> BoolArray:
     """Return whether (N,) samples are where earlier ones were, by the lengths of ways between."""
     back: BoolArray = (distances(before, after) / _STEP).max(axis=1) < _BACK * steps
@@ -164,7 +175,7 @@ def _is_back(
 
 
 def _tracks(
-    times: IntArray, distances: Distances, left: IntArray, starts: IntArray, limits: MotionLimits
+    times: IntArray, distances: Distances, *, left: IntArray, starts: IntArray, limits: MotionLimits
 ) -> IntArray:
     """Return numbers (L,) of the motions that samples `left` (L,) belong to.
 
@@ -178,7 +189,9 @@ def _tracks(
     for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
         lasts = np.array([last for last, _ in recent], dtype=np.int64)
         first = np.full(len(lasts), left[start])
-        possible = np.flatnonzero(_reachable(times, distances, lasts, first, limits))
+        possible = np.flatnonzero(
+            _reachable(times, distances, first=lasts, second=first, limits=limits)
+        )
         if len(possible):
             number = recent.pop(int(possible[0]))[1]
         else:
@@ -191,6 +204,7 @@ def _tracks(
 def _choose(
     tracks: IntArray,
     distances: Distances,
+    *,
     left: IntArray,
     outliers: BoolArray,
     disputed: BoolArray,
@@ -205,7 +219,8 @@ def _choose(
     for number in np.argsort(-sizes, kind="stable").tolist()[1:]:
         if short[number]:
             break
-        own, others = np.flatnonzero(tracks == number), np.flatnonzero(accepted)
+        own = np.flatnonzero(tracks == number)
+        others = np.flatnonzero(accepted)
         within = own[(own > others[0]) & (own < others[-1])]
         among = others[(others > own[0]) & (others < own[-1])]
         if len(within) == 0:
@@ -215,7 +230,9 @@ def _choose(
             place = int(np.searchsorted(others, own[0]))
             way = left[[others[place - 1], own[0], own[-1], others[place]]]
             steps = (distances(way[:-1:2], way[1::2]) / _STEP).max(axis=1)
-            leave_out = bool(_is_back(distances, way[:1], way[-1:], steps.min(keepdims=True))[0])
+            leave_out = bool(
+                _is_back(distances, way[:1], after=way[-1:], steps=steps.min(keepdims=True))[0]
+            )
         else:
             leave_out = len(within) < _OUTLIERS * len(among)
             if not leave_out:

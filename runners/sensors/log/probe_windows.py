@@ -42,7 +42,7 @@ class ProbeWindow:
 
 
 def marked_windows(
-    markers: Iterable[tuple[int, str]], first: int, last: int, warnings: LogWarnings
+    markers: Iterable[tuple[int, str]], first: int, *, last: int, warnings: LogWarnings
 ) -> list[ProbeWindow]:
     """Return the probes of markers (time, text) in a log from `first` to `last`, if any.
 
@@ -59,7 +59,8 @@ def marked_windows(
             begins = text != "false" and not text.startswith("-")
             index = int(text) if begins and text != "true" else None
         elif match:
-            begins, index = match[1] == "begin", int(match[2]) if match[2] else None
+            begins = match[1] == "begin"
+            index = int(match[2]) if match[2] else None
         else:
             warnings.warn(f"a marker is {text[:40]!r}; accepted: begin N, end")
             continue
@@ -76,11 +77,11 @@ def marked_windows(
     if begun is not None:
         warnings.warn("the last probe has a begin and no end; the log's end ends it")
         spans.append((begun[0], max(last, begun[0]), begun[1]))
-    return _windows(spans, first, last, warnings)
+    return _windows(spans, first, last=last, warnings=warnings)
 
 
 def timed_windows(
-    probes: Sequence[ProbeTimes], first: int, last: int, warnings: LogWarnings
+    probes: Sequence[ProbeTimes], first: int, *, last: int, warnings: LogWarnings
 ) -> list[ProbeWindow]:
     """Return the probes that a rig names by seconds since the first message.
 
@@ -99,15 +100,17 @@ def timed_windows(
         if begin > last:
             warnings.warn(f"probe {index} begins after the end of the log")
         spans.append((begin, end, index))
-    return _windows(spans, first, last, warnings)
+    return _windows(spans, first, last=last, warnings=warnings)
 
 
 def whole_log(first: int, last: int) -> list[ProbeWindow]:
     """Return all of a log as a single probe."""
-    return [ProbeWindow(0, first, first, last, last + 1)]
+    return [ProbeWindow(0, first, begin=first, end=last, closes=last + 1)]
 
 
-def _windows(spans: list[_Span], first: int, last: int, warnings: LogWarnings) -> list[ProbeWindow]:
+def _windows(
+    spans: list[_Span], first: int, *, last: int, warnings: LogWarnings
+) -> list[ProbeWindow]:
     """Return windows of spans in order of time; count those whose indices do not rise from 0."""
     if not spans:
         return []
@@ -123,6 +126,6 @@ def _windows(spans: list[_Span], first: int, last: int, warnings: LogWarnings) -
     opens = [min(first, spans[0][0]), *(begin for begin, _, _ in spans[1:])]
     closes = [*opens[1:], max(last, spans[-1][1]) + 1]
     return [
-        ProbeWindow(step, opened, begin, end, closed)
+        ProbeWindow(step, opened, begin=begin, end=end, closes=closed)
         for step, opened, (begin, end, _), closed in zip(steps, opens, spans, closes, strict=True)
     ]

@@ -108,20 +108,22 @@ class RawLog:
             progress(sum(done), self.size)
 
         def read(number: int) -> Iterator[RawMessage]:
-            return self._parts[number].messages(topics, fault, partial(report, number))
+            return self._parts[number].messages(topics, fault, progress=partial(report, number))
 
         readings = [chain.from_iterable(map(read, numbers)) for numbers in self._series]
         for message in heapq.merge(*readings, key=lambda message: message.log_time):
             channel = message.channel
             if channel not in decoders:
-                decoders[channel] = decoder(channel.schema, channel.encoding, channel.definition)
+                decoders[channel] = decoder(
+                    channel.schema, channel.encoding, definition=channel.definition
+                )
             for stamp, content in decoders[channel](message.data):
                 if isinstance(content, UnusableMessage):
                     fault(f"{channel.topic}: {content}")
                     continue
                 if isinstance(content, TransformMessage) and channel.topic.endswith(_STATIC):
                     content = replace(content, static=True)
-                yield Received(channel.topic, message.log_time, stamp, content)
+                yield Received(channel.topic, message.log_time, stamp=stamp, content=content)
         self.faults |= faults
         progress(self.size, self.size)
 
@@ -133,7 +135,7 @@ class RawLog:
             read = part.messages(
                 None,
                 lambda text: faults.update([one_line(text)]),
-                lambda done: progress(done, self.size),
+                progress=lambda done: progress(done, self.size),
             )
             for message in read:
                 times = message.log_time, *span

@@ -71,7 +71,9 @@ class TransformTree:
                 self.faults[f"frame {child} is both static and moving; what moves counts"] += 1
         self._gather_times()
 
-    def check_motions(self, world: str, frames: Iterable[str], limits: MotionLimits) -> list[str]:
+    def check_motions(
+        self, world: str, frames: Iterable[str], *, limits: MotionLimits
+    ) -> list[str]:
         """Leave out implausible samples of the transforms between frames and the world.
 
         Return what a user should know of them. Raise TransformError as `lookup` does.
@@ -101,7 +103,7 @@ class TransformTree:
         times = [edge.times for edge in self._edges.values()]
         self.times = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *times]))
 
-    def lookup(self, target: str, source: str, stamp_ns: int, *, gap_s: float) -> FloatArray:
+    def lookup(self, target: str, source: str, *, stamp_ns: int, gap_s: float) -> FloatArray:
         """Return target_from_source (4, 4) at a time, nanoseconds.
 
         Linear in position and along the shorter arc of rotation between samples at most `gap_s`
@@ -109,7 +111,7 @@ class TransformTree:
         Raise TransformError if a frame is unknown, not connected, or not known at that time.
         """
         stamps = np.array([stamp_ns])
-        poses, valid = self.lookups(target, source, stamps, gap_s=gap_s)
+        poses, valid = self.lookups(target, source, stamps_ns=stamps, gap_s=gap_s)
         if not valid[0]:
             down, up = self._path(target, source)
             edges = [(child, self._edges[child]) for child in (*down, *up)]
@@ -128,7 +130,7 @@ class TransformTree:
         return pose
 
     def lookups(
-        self, target: str, source: str, stamps_ns: IntArray, *, gap_s: float
+        self, target: str, source: str, *, stamps_ns: IntArray, gap_s: float
     ) -> tuple[FloatArray, BoolArray]:
         """Return target_from_source (N, 4, 4) at times (N,), NaN if unknown, and which are known.
 
@@ -143,7 +145,8 @@ class TransformTree:
             root = np.tile(np.eye(4), (len(stamps), 1, 1))
             for child in chain:
                 parent_from_child, known = self._edges[child].at(stamps, gap_s)
-                root, valid = parent_from_child @ root, valid & known
+                root = parent_from_child @ root
+                valid = valid & known
             poses = inverse(root) @ poses if flip else root @ poses
         poses[~valid] = np.nan
         return poses, valid
@@ -215,7 +218,10 @@ class _Edge:
         """Sort the poses by time; of equal times the first that came counts."""
         if not self._added:
             return
-        times = [clocks.times(topic, *some[:2]) for topic, some in self._added.items()]
+        times = [
+            clocks.times(topic, log_times, stamps=stamps)
+            for topic, (log_times, stamps, _) in self._added.items()
+        ]
         numbers = np.concatenate([np.frombuffer(some[2]) for some in self._added.values()])
         every = np.concatenate(times)
         self.times, chosen, sample = np.unique(every, return_index=True, return_inverse=True)
@@ -227,7 +233,8 @@ class _Edge:
             others = poses[apart]
             self._contradicting = every[apart], others[:, :3, 3], quaternions(others[:, :3, :3])
         poses = poses[chosen]
-        self._positions, self._quaternions = poses[:, :3, 3], quaternions(poses[:, :3, :3])
+        self._positions = poses[:, :3, 3]
+        self._quaternions = quaternions(poses[:, :3, :3])
         self._jumps = np.zeros(len(self.times), dtype=bool)
         self._topics = tuple(self._added)
         self._added.clear()
@@ -244,7 +251,8 @@ class _Edge:
         positions = self._positions
         turns = self._quaternions
         if self._contradicting is not None:
-            others, self._contradicting = self._contradicting, None
+            others = self._contradicting
+            self._contradicting = None
             order = np.argsort(np.concatenate([times, others[0]]), kind="stable")
             times = np.concatenate([times, others[0]])[order]
             positions = np.concatenate([positions, others[1]])[order]
@@ -256,7 +264,7 @@ class _Edge:
             return np.stack([away, 2.0 * np.arccos(np.minimum(same, 1.0))], axis=1)
 
         blank = (positions == 0.0).all(axis=1) & (np.abs(turns[:, 3]) == 1.0)
-        found = check_motion(times, distances, limits, blank)
+        found = check_motion(times, distances, limits=limits, blank=blank)
         topics = " and ".join(self._topics)
         remarks = found.remarks(f"{child} in {self.parent}, on {topics},", limits)
         self.remarks += remarks
@@ -288,7 +296,7 @@ class _Edge:
         fraction = np.where(span > 0.0, np.clip(to_left / np.where(span > 0.0, span, 1.0), 0, 1), 0)
         first, second = self._positions[left], self._positions[right]
         position = first + fraction[:, None] * (second - first)
-        turned = slerp(self._quaternions[left], self._quaternions[right], fraction)
+        turned = slerp(self._quaternions[left], self._quaternions[right], fraction=fraction)
         return compose(rotation_matrices(turned), position), near
 
     def nearest(self, stamp: int) -> float:
@@ -355,7 +363,7 @@ class JointHistory:
             return np.stack([way.max(axis=1, initial=0.0) for way in ways], axis=1)
 
         times = np.array([time for time, _ in timed], dtype=np.int64)
-        found = check_motion(times, distances, limits)
+        found = check_motion(times, distances, limits=limits)
         before: Joints | None = {}
         for (time, state), kept, disputed in zip(timed, found.kept, found.disputed, strict=True):
             chosen = None if disputed else state if kept else before

@@ -31,11 +31,11 @@ FREE_TERMS = pytest.mark.parametrize("free_term", ["direct", "interior"])
 @cache
 def grid_of(name):
     if name == "sphere":
-        return ball_grid(0.05, 0.01, 9)
+        return ball_grid(0.05, 0.01, half=9)
     if name == "box":
         return SdfGrid.from_mesh(trimesh.creation.box(BOX_SIDES), 0.006, padding=0.03)
     if name == "dyadic":  # a grid whose nodes and borders are exact numbers
-        return ball_grid(0.07, 2.0**-6, 8)
+        return ball_grid(0.07, 2.0**-6, half=8)
     legs = [trimesh.creation.box(sides) for sides in ((0.16, 0.07, 0.06), (0.07, 0.14, 0.06))]
     legs[0].apply_translation([0.05, -0.04, 0.0])
     resolution = 0.004 if name == "fine l_shape" else 0.012
@@ -54,7 +54,7 @@ class Case:
     def cost(self, made=CompiledCost, **options):
         resolution = self.free_resolution
         sdf = grid_of(self.shape)
-        return made(sdf, self.points, self.settings, free_resolution=resolution, **options)
+        return made(sdf, self.points, settings=self.settings, free_resolution=resolution, **options)
 
     def objective(self, culling="octree"):
         return Objective(self.cost(culling=culling), self.space)
@@ -90,23 +90,29 @@ def cases(draw):
         known_tolerance=draw(st.sampled_from([0.0, 0.015])),
     )
     occupied = stream.uniform(-0.15, 0.15, (draw(st.integers(0, 6)), 3))
-    points = KnownPoints(free, occupied, known, stream.uniform(-0.03, 0.03, len(known)))
-    count, reach = draw(st.integers(1, 9)), draw(st.sampled_from([0.03, 0.1, 0.4]))
+    points = KnownPoints(
+        free, occupied, known=known, known_sdf=stream.uniform(-0.03, 0.03, len(known))
+    )
+    count = draw(st.integers(1, 9))
+    reach = draw(st.sampled_from([0.03, 0.1, 0.4]))
     space = SE3Space()
     if draw(st.integers(0, 3)) == 0:
         axis = tuple(stream.standard_normal(3).tolist())
         space = SE2Space(PlaneSettings(axis=axis, offset=0.01), grid_of(shape))
-    vectors = space.encode(Poses.of(random_poses(stream, count, reach)))
+    vectors = space.encode(Poses.of(random_poses(stream, count, reach=reach)))
     if space.dimension == 9:  # raw vectors are not orthonormal
         vectors[:, :6] += stream.uniform(-0.2, 0.2, (count, 6))
-    return Case(shape, points, changes, resolution, vectors, space)
+    return Case(
+        shape, points, settings=changes, free_resolution=resolution, vectors=vectors, space=space
+    )
 
 
 def assert_equals_torch(case):
     leaves = torch.tensor(case.vectors, requires_grad=True)
     values = case.cost(RelaxedCost)(*decode(case.space, leaves))
     values.sum().backward()
-    values, gradients = values.detach().numpy(), leaves.grad.numpy()
+    values = values.detach().numpy()
+    gradients = leaves.grad.numpy()
     found, slopes = case.objective().costs_and_gradients(case.vectors)
     np.testing.assert_allclose(found, values, rtol=1e-12, atol=1e-14)
     size = 1.0 + np.abs(gradients).max(axis=1, keepdims=True)
@@ -129,7 +135,8 @@ def test_costs_and_gradients_are_those_of_the_torch_cost(case):
 @settings(max_examples=60, deadline=None)
 @given(case=cases())
 def test_culling_batches_threads_and_gradients_change_no_bit(case):
-    objective, vectors = case.objective(), case.vectors
+    objective = case.objective()
+    vectors = case.vectors
     costs, gradients = objective.costs_and_gradients(vectors)
     assert_same_bits(costs, objective.costs(vectors))
     others = [case.objective("none").costs_and_gradients(vectors)]
@@ -144,7 +151,7 @@ def test_culling_batches_threads_and_gradients_change_no_bit(case):
         assert_same_bits(gradients, other_gradients)
 
 
-def descended_plainly(objective, vectors, divisor, rate, iterations):
+def descended_plainly(objective, vectors, *, divisor, rate, iterations):
     """Adam, asking all points at every step; the operations are those of the kernel."""
     mean, square = np.zeros_like(vectors), np.zeros_like(vectors)
     power1 = power2 = 1.0
@@ -160,21 +167,26 @@ def descended_plainly(objective, vectors, divisor, rate, iterations):
     return vectors
 
 
-def descends_plainly(case, *how):
+def descends_plainly(case, divisor, *, rate, iterations):
     """Where a descent ends, which is where one without neighbour lists does."""
-    plain = descended_plainly(case.objective("none"), case.vectors, *how)
-    assert_same_bits(case.objective().descended(case.vectors, *how), plain)
+    plain = descended_plainly(
+        case.objective("none"), case.vectors, divisor=divisor, rate=rate, iterations=iterations
+    )
+    ends = case.objective().descended(case.vectors, divisor, rate=rate, iterations=iterations)
+    assert_same_bits(ends, plain)
     return plain
 
 
 @settings(max_examples=60, deadline=None)
 @given(case=cases(), rate=st.sampled_from([1e-4, 1e-3, 0.01, 0.1, 1.0]))
 def test_descent_with_neighbour_lists_is_to_the_bit_descent_over_all_points(case, rate):
-    plain = descends_plainly(case, 3.0, rate, 40)
+    plain = descends_plainly(case, 3.0, rate=rate, iterations=40)
     objective = case.objective()
     with threads(2):
-        assert_same_bits(objective.descended(case.vectors, 3.0, rate, 40), plain)
-        assert_same_bits(objective.descended(case.vectors[:1].copy(), 3.0, rate, 40), plain[:1])
+        assert_same_bits(objective.descended(case.vectors, 3.0, rate=rate, iterations=40), plain)
+        assert_same_bits(
+            objective.descended(case.vectors[:1].copy(), 3.0, rate=rate, iterations=40), plain[:1]
+        )
 
 
 class Turntable(SE2Space):
@@ -196,8 +208,15 @@ def test_an_object_that_turns_misses_none_of_the_points_that_it_sweeps(free_term
     vectors = np.zeros((3, 3))
     vectors[:, 0] = np.arange(3) * 1.6
     shape = "fine l_shape" if free_term == "direct" else "l_shape"
-    case = Case(shape, points, changes, 0.005, vectors, Turntable(grid_of("l_shape")))
-    plain = descends_plainly(case, 1.0, turn, 20)
+    case = Case(
+        shape,
+        points,
+        settings=changes,
+        free_resolution=0.005,
+        vectors=vectors,
+        space=Turntable(grid_of("l_shape")),
+    )
+    plain = descends_plainly(case, 1.0, rate=turn, iterations=20)
     assert (np.abs(plain[:, 0] - vectors[:, 0]) > 5.0 * turn).any()
 
 
@@ -211,9 +230,15 @@ def test_an_object_that_comes_into_free_space_from_outside_misses_none_of_its_po
     vectors = posed(compose(np.tile(rotation, (len(away), 1, 1)), away[:, None] * x))
     free = np.random.default_rng(17).uniform([0.0, -0.05, -0.05], [0.2, 0.05, 0.05], (20_000, 3))
     points = KnownPoints(free, known=[[1.0, 0.0, 0.0], [1.0, 0.1, 0.0]])
-    case = Case("box", points, CostSettings(penetration_tolerance=0.0), 0.005, vectors)
+    case = Case(
+        "box",
+        points,
+        settings=CostSettings(penetration_tolerance=0.0),
+        free_resolution=0.005,
+        vectors=vectors,
+    )
     for rate in (0.002, 0.005):
-        plain = descends_plainly(case, 1.0, rate, 20)
+        plain = descends_plainly(case, 1.0, rate=rate, iterations=20)
     free_alone = replace(case, points=KnownPoints(free=free)).objective("none")
     assert not free_alone.costs(vectors)[1:].any()
     assert (free_alone.costs(plain) > 0.0).sum() > 5
@@ -234,11 +259,15 @@ SCATTERED = np.random.default_rng(3).uniform(-0.2, 0.2, (200_000, 3))
     ("free", "lookup"), [(ON_LATTICE, "nearest"), (ON_LATTICE, "trilinear"), (SCATTERED, "nearest")]
 )
 def test_200_000_free_points_cost_to_the_bit_what_they_cost_without_culling(free, lookup):
-    transforms = random_poses(np.random.default_rng(4), 5, 0.2)
+    transforms = random_poses(np.random.default_rng(4), 5, reach=0.2)
     transforms[0] = np.eye(4)
     poses = Poses.of(transforms)
     case = Case(
-        "l_shape", KnownPoints(free=free), CostSettings(lookup=lookup), 0.005, posed(transforms)
+        "l_shape",
+        KnownPoints(free=free),
+        settings=CostSettings(lookup=lookup),
+        free_resolution=0.005,
+        vectors=posed(transforms),
     )
     costs = case.cost().costs(poses)
     assert costs[0] > 1.0
@@ -247,7 +276,8 @@ def test_200_000_free_points_cost_to_the_bit_what_they_cost_without_culling(free
 
 def border_points(sdf):
     """Nodes, middles between them, corners of the grid, and the numbers next to all of these."""
-    stream, (first, last) = np.random.default_rng(5), sdf.bounds
+    stream = np.random.default_rng(5)
+    (first, last) = sdf.bounds
     nodes = stream.integers(0, np.array(sdf.shape), (300, 3))
     halves = nodes - 0.5 * stream.integers(0, 2, (300, 3))
     points = [first + halves * sdf.resolution]
@@ -281,7 +311,11 @@ def test_points_on_borders_of_voxels_and_of_the_grid_read_what_the_torch_cost_re
             KnownPoints(known=world),
         ):
             one = vectors[n : n + 1].copy()
-            assert_equals_torch(Case("dyadic", points, changes, sdf.resolution, one))
+            assert_equals_torch(
+                Case(
+                    "dyadic", points, settings=changes, free_resolution=sdf.resolution, vectors=one
+                )
+            )
 
 
 def test_free_voxels_are_read_on_their_borders_as_the_torch_cost_reads_them():
@@ -290,7 +324,9 @@ def test_free_voxels_are_read_on_their_borders_as_the_torch_cost_reads_them():
     changes = CostSettings(free_term="interior", interior_spacing=0.5 * step)
     shifts = step * np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.25], [1.5, -1.0, 2.5]])
     vectors = posed(compose(np.tile(np.eye(3), (3, 1, 1)), shifts))
-    case = Case("dyadic", KnownPoints(free=free), changes, step, vectors)
+    case = Case(
+        "dyadic", KnownPoints(free=free), settings=changes, free_resolution=step, vectors=vectors
+    )
     assert case.objective().costs(vectors)[0] > 0.0
     assert_equals_torch(case)
 
@@ -306,11 +342,17 @@ def test_a_scene_far_from_the_origin_is_culled_without_loss(far, free_term):
     turns[0] = np.eye(3)
     vectors = posed(compose(turns, -(turns @ shift) + stream.uniform(-0.03, 0.03, (6, 3))))
     points = KnownPoints(free, known=free[:9] + 0.01)
-    case = Case("box", points, CostSettings(free_term=free_term), 0.01, vectors)
+    case = Case(
+        "box",
+        points,
+        settings=CostSettings(free_term=free_term),
+        free_resolution=0.01,
+        vectors=vectors,
+    )
     costs = case.objective().costs(vectors)
     assert (costs[1:] > 0.0).any()
     assert_same_bits(costs, case.objective("none").costs(vectors))
-    descends_plainly(case, 1.0, 1e-3, 30)
+    descends_plainly(case, 1.0, rate=1e-3, iterations=30)
 
 
 @FREE_TERMS
@@ -320,12 +362,14 @@ def test_a_pose_that_is_not_finite_leaves_the_lanes_beside_it_to_the_bit_as_they
 ):
     stream = np.random.default_rng(16)
     near = stream.uniform(-0.1, 0.1, (900, 3))
-    points = KnownPoints(near, near[:3], near[:9])
-    vectors = posed(random_poses(stream, LANES, 0.02))
+    points = KnownPoints(near, near[:3], known=near[:9])
+    vectors = posed(random_poses(stream, LANES, reach=0.02))
     changes = CostSettings(free_term=free_term, lookup="nearest")
-    objective = Case("l_shape", points, changes, 0.02, vectors).objective()
+    objective = Case(
+        "l_shape", points, settings=changes, free_resolution=0.02, vectors=vectors
+    ).objective()
     costs, slopes = objective.costs_and_gradients(vectors)
-    moved = objective.descended(vectors, 3.0, 0.01, 20)
+    moved = objective.descended(vectors, 3.0, rate=0.01, iterations=20)
     assert (costs > 0.0).all()
     assert (moved != vectors).any(axis=1).all()
     for lane in range(LANES):
@@ -338,7 +382,9 @@ def test_a_pose_that_is_not_finite_leaves_the_lanes_beside_it_to_the_bit_as_they
         assert_same_bits(found[others], costs[others])
         assert_same_bits(gradients[others], slopes[others])
         assert_same_bits(objective.costs(spoiled)[others], costs[others])
-        assert_same_bits(objective.descended(spoiled, 3.0, 0.01, 20)[others], moved[others])
+        assert_same_bits(
+            objective.descended(spoiled, 3.0, rate=0.01, iterations=20)[others], moved[others]
+        )
 
 
 @pytest.mark.parametrize("made", [RelaxedCost, CompiledCost])
@@ -346,21 +392,22 @@ def test_tolerance_deeper_than_the_object_is_a_warning_and_costs_free_points_not
     changes = CostSettings(penetration_tolerance=-0.2)
     free = np.random.default_rng(12).uniform(-0.05, 0.05, (100, 3))
     with pytest.warns(UserWarning, match="cannot be violated"):
-        cost = made(grid_of("box"), KnownPoints(free=free), changes)
+        cost = made(grid_of("box"), KnownPoints(free=free), settings=changes)
     assert cost.evaluate(np.eye(4)[None])[0] == 0.0
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        made(grid_of("box"), KnownPoints(known=free), changes)
+        made(grid_of("box"), KnownPoints(known=free), settings=changes)
 
 
 @pytest.mark.filterwarnings("ignore:.*cannot be violated")
 @pytest.mark.parametrize("made", [CompiledCost, RelaxedCost])
 def test_what_has_no_cost_says_what_is_accepted(made):
-    sdf, free = grid_of("box"), KnownPoints(free=[[0.0, 0.0, 0.0]])
+    sdf = grid_of("box")
+    free = KnownPoints(free=[[0.0, 0.0, 0.0]])
     interior = CostSettings(free_term="interior")
     with pytest.raises(SettingError, match="penetration_tolerance nearer to 0"):
-        made(sdf, free, replace(interior, penetration_tolerance=-0.2))
+        made(sdf, free, settings=replace(interior, penetration_tolerance=-0.2))
     with pytest.raises(SettingError, match="coarser free_resolution"):
-        made(sdf, KnownPoints(free=[[0.0, 0.0, 0.0], [1e9, 1e9, 1e9]]), interior)
+        made(sdf, KnownPoints(free=[[0.0, 0.0, 0.0], [1e9, 1e9, 1e9]]), settings=interior)
     with pytest.raises(PoseError, match=r"has shape \(4, 4\); accepted: \(any, 4, 4\)"):
         made(sdf, free).evaluate(np.eye(4))

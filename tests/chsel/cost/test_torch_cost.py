@@ -14,13 +14,13 @@ from chsel.problem.search_space import SE3Space
 from tests.chsel.samples import ball_grid, decode, random_poses
 
 RADIUS = 0.1
-SPHERE = ball_grid(RADIUS, 0.01, 25)  # whose nodes hold the points of the closed forms
+SPHERE = ball_grid(RADIUS, 0.01, half=25)  # whose nodes hold the points of the closed forms
 SETTINGS = CostSettings(penetration_tolerance=-0.01)
 IDENTITY = np.eye(4)[None]
 
 
 def value_and_translation_gradient(points, **changes):
-    cost = RelaxedCost(SPHERE, points, replace(SETTINGS, **changes))
+    cost = RelaxedCost(SPHERE, points, settings=replace(SETTINGS, **changes))
     translation = torch.zeros((1, 3), dtype=torch.float64, requires_grad=True)
     value = cost(torch.eye(3, dtype=torch.float64)[None], translation)
     (gradient,) = torch.autograd.grad(value.sum(), translation)
@@ -46,7 +46,7 @@ def test_terms_of_a_sphere_have_their_closed_form(points, value, gradient, looku
     found, slope = value_and_translation_gradient(points, lookup=lookup)
     assert found == pytest.approx(value, abs=1e-9)
     np.testing.assert_allclose(slope, gradient, atol=1e-9)
-    compiled = CompiledCost(SPHERE, points, replace(SETTINGS, lookup=lookup))
+    compiled = CompiledCost(SPHERE, points, settings=replace(SETTINGS, lookup=lookup))
     vectors = SE3Space().encode(Poses.of(IDENTITY))
     costs, gradients = Objective(compiled, SE3Space()).costs_and_gradients(vectors)
     assert costs[0] == pytest.approx(value, abs=1e-9)
@@ -65,7 +65,9 @@ def test_exact_gradient_is_the_derivative_of_the_value():
     _, gradient = value_and_translation_gradient(points, gradient="exact")
     poses = np.tile(np.eye(4), (6, 1, 1))
     poses[:, :3, 3] = 1e-4 * np.concatenate([np.eye(3), -np.eye(3)])
-    costs = RelaxedCost(SPHERE, points, replace(SETTINGS, gradient="exact")).evaluate(poses)
+    costs = RelaxedCost(SPHERE, points, settings=replace(SETTINGS, gradient="exact")).evaluate(
+        poses
+    )
     np.testing.assert_allclose(gradient, (costs[:3] - costs[3:]) / 2e-4, rtol=1e-3, atol=1e-6)
 
 
@@ -79,16 +81,19 @@ def test_gradient_by_the_search_vector_is_the_defined_point_gradient_chain_ruled
         known=stream.uniform(-0.2, 0.2, (9, 3)),
         known_sdf=stream.uniform(-0.02, 0.02, 9),
     )
-    settings, space = replace(SETTINGS, free_term=free_term, lookup="nearest"), SE3Space()
-    cost = RelaxedCost(SPHERE, points, settings, free_resolution=0.02)
-    vector = space.encode(Poses.of(random_poses(stream, 1, 0.02)))
+    settings = replace(SETTINGS, free_term=free_term, lookup="nearest")
+    space = SE3Space()
+    cost = RelaxedCost(SPHERE, points, settings=settings, free_resolution=0.02)
+    vector = space.encode(Poses.of(random_poses(stream, 1, reach=0.02)))
     vector[:, :6] *= 1.3  # raw vectors are not orthonormal
-    moved, point_gradients = point_gradients_by_hand(cost, points, vector, free_term)
+    moved, point_gradients = point_gradients_by_hand(
+        cost, points, vector=vector, free_term=free_term
+    )
     expected = [
         ((moved(vector + step) - moved(vector - step)) / 2e-6 * point_gradients).sum()
         for step in 1e-6 * np.eye(9)
     ]
-    compiled = CompiledCost(SPHERE, points, settings, free_resolution=0.02)
+    compiled = CompiledCost(SPHERE, points, settings=settings, free_resolution=0.02)
     _, gradient = Objective(compiled, space).costs_and_gradients(vector)
     np.testing.assert_allclose(gradient[0], expected, rtol=1e-6, atol=1e-8)
     leaf = torch.tensor(vector, requires_grad=True)
@@ -96,7 +101,7 @@ def test_gradient_by_the_search_vector_is_the_defined_point_gradient_chain_ruled
     np.testing.assert_allclose(leaf.grad[0], expected, rtol=1e-6, atol=1e-8)
 
 
-def point_gradients_by_hand(cost, points, vector, free_term):
+def point_gradients_by_hand(cost, points, *, vector, free_term):
     """How the points that the cost looks at move, and dC/d(moved point) as the paper defines it."""
     interior = cost._inside.numpy() if free_term == "interior" else np.zeros((0, 3))
     free = points.free if free_term == "direct" else np.zeros((0, 3))
@@ -130,7 +135,7 @@ def test_interior_term_counts_interior_points_in_free_voxels():
     axis = np.arange(-12, 13) * 0.01
     free = np.stack(np.meshgrid(axis[axis > 0], axis, axis, indexing="ij"), -1).reshape(-1, 3)
     settings = replace(SETTINGS, free_term="interior", lookup="nearest")
-    cost = RelaxedCost(SPHERE, KnownPoints(free=free), settings, free_resolution=0.01)
+    cost = RelaxedCost(SPHERE, KnownPoints(free=free), settings=settings, free_resolution=0.01)
     nodes = np.moveaxis(np.indices((51, 51, 51)), 0, -1) * 0.01 - 25 * 0.01
     s = np.sqrt((nodes**2).sum(-1)) - RADIUS
     deep = (s < -0.01) & (nodes[..., 0] > 0.005)
@@ -138,10 +143,11 @@ def test_interior_term_counts_interior_points_in_free_voxels():
 
 
 def test_volume_normalise_weighs_interior_points_by_their_voxel_share():
-    points, interior = KnownPoints(free=[[0.0, 0.0, 0.0]]), replace(SETTINGS, free_term="interior")
+    points = KnownPoints(free=[[0.0, 0.0, 0.0]])
+    interior = replace(SETTINGS, free_term="interior")
     by_volume = replace(interior, volume_normalise=True)
     plain, normal = (
-        RelaxedCost(SPHERE, points, settings, free_resolution=0.04).evaluate(IDENTITY)[0]
+        RelaxedCost(SPHERE, points, settings=settings, free_resolution=0.04).evaluate(IDENTITY)[0]
         for settings in (interior, by_volume)
     )
     assert normal == pytest.approx(plain / 64)

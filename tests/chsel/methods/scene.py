@@ -67,15 +67,22 @@ def on_faces(count, height=0.0):
 
 def box_problem(points):
     """Points of BOX, whatever its pose."""
-    return RegistrationProblem(BOX_GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
+    return RegistrationProblem(
+        sdf=BOX_GRID,
+        points=points,
+        initial_set=np.eye(4)[None],
+        workspace=WORKSPACE,
+        free_resolution=0.03,
+        key=StreamKey(5, 2),
+    )
 
 
 def energy_of(points, noise):
     """The energy of poses of BOX."""
-    return Energy(box_problem(points), most_informative_first(points), noise)
+    return Energy(box_problem(points), most_informative_first(points), noise=noise)
 
 
-def poses_around_truth(count, shift, turn):
+def poses_around_truth(count, shift, *, turn):
     """Poses turned by an angle, radians, and shifted in any direction by a length, metres."""
     random = np.random.default_rng(count)
     axes, ways = random.standard_normal((2, count, 3))
@@ -116,14 +123,22 @@ ODD = {
 """Points that tell little, or are hardly those of an object."""
 
 
-def posed(method, points=POINTS, previous=None, sdf=GRID, **changes):
+def posed(method, points=POINTS, *, previous=None, sdf=GRID, **changes):
     """The problem that a method is given, with other fields as said."""
     key = StreamKey(3, 1)
-    problem = pose_problem(sdf, points, WORKSPACE, SIDE, key, method.online, previous)
+    problem = pose_problem(
+        sdf,
+        points,
+        workspace=WORKSPACE,
+        free_resolution=SIDE,
+        key=key,
+        settings=method.online,
+        previous=previous,
+    )
     return replace(problem, **changes)
 
 
-def around_truth(count=8, angle=0.3, shift=0.03):
+def around_truth(count=8, angle=0.3, *, shift=0.03):
     """E_0 (count, 4, 4), turned by an angle and shifted at random."""
     random = np.random.default_rng(3)
     axis = random.standard_normal((count, 3))
@@ -159,7 +174,7 @@ class Watcher(NullObserver):
 
     def trace(self, stage, iteration, vectors, cost):
         """Keep copies."""
-        self.traces.append(Trace(stage, iteration, vectors.copy(), cost.copy()))
+        self.traces.append(Trace(stage, iteration, vectors=vectors.copy(), cost=cost.copy()))
         vectors[:], cost[:] = np.nan, np.nan
 
     def progress(self, stage, iteration, total):

@@ -28,14 +28,15 @@ PAIRS, SINGLES = AnchorSettings(1.0, 0.0), AnchorSettings(0.0, 1.0)
 UNIFORM = AnchorSettings(0.0, 0.0)
 
 
-def drawn(points, settings, samples=3000, most=3000, plane=None, index=0, left_out=0):
+def drawn(points, settings, *, samples=3000, most=3000, plane=None, index=0, left_out=0):
     """The best poses (K, 12); all of them where most is as many."""
-    space, known = search_space(plane, BOX_GRID), most_informative_first(points)
-    sampler = AnchorSampler(box_problem(points), known, space, settings)
+    space = search_space(plane, BOX_GRID)
+    known = most_informative_first(points)
+    sampler = AnchorSampler(box_problem(points), known, space=space, settings=settings)
     return sampler.best(samples, most, index=index, left_out=left_out).numbers
 
 
-def distances(poses, points, lookup="trilinear"):
+def distances(poses, points, *, lookup="trilinear"):
     """Signed distances (B, M) at world points."""
     rotations = poses[:, :9].reshape(-1, 3, 3)
     moved = np.einsum("nij,mj->nmi", rotations, points) + poses[:, None, 9:]
@@ -63,7 +64,7 @@ def test_a_point_of_known_distance_is_met_at_that_distance(value):
 
 
 def test_rotations_are_rigid_and_objects_within_bounds():
-    lower, upper = origin_bounds(WORKSPACE, search_space(None, BOX_GRID), 0.15)
+    lower, upper = origin_bounds(WORKSPACE, search_space(None, BOX_GRID), margin=0.15)
     np.testing.assert_allclose(lower, np.array(WORKSPACE.lower) - 0.15)
     poses = drawn(KnownPoints(known=CONTACTS), AnchorSettings())
     rotations = poses[:, :9].reshape(-1, 3, 3)
@@ -78,14 +79,16 @@ def test_the_best_are_the_first_of_all_and_do_not_depend_on_threads():
     free = np.random.default_rng(0).uniform(-0.1, 0.5, (3000, 3))
     points = KnownPoints(free=free, known=CONTACTS)
     count = 70_000  # more than are drawn at once
-    every = drawn(points, AnchorSettings(), count, count)
+    every = drawn(points, AnchorSettings(), samples=count, most=count)
     with threads(1):
-        one = drawn(points, AnchorSettings(), count, 40)
+        one = drawn(points, AnchorSettings(), samples=count, most=40)
     with threads(2):
-        two = drawn(points, AnchorSettings(), count, 40)
+        two = drawn(points, AnchorSettings(), samples=count, most=40)
     np.testing.assert_array_equal(one, two)
     np.testing.assert_array_equal(one, every[:40])
-    assert np.abs(drawn(points, AnchorSettings(), count, 40, index=1) - one).max() > 1e-3
+    assert (
+        np.abs(drawn(points, AnchorSettings(), samples=count, most=40, index=1) - one).max() > 1e-3
+    )
 
 
 def test_sines_and_cosines_are_those_of_shares_of_a_turn():
@@ -111,7 +114,8 @@ def test_on_a_plane_poses_stand_on_it_and_still_meet_contacts(axis, value):
 
 def test_known_points_come_far_apart_first_and_none_is_lost():
     random = np.random.default_rng(2)
-    known, values = random.standard_normal((200, 3)), random.standard_normal(200)
+    known = random.standard_normal((200, 3))
+    values = random.standard_normal(200)
     ordered = most_informative_first(KnownPoints(known=known, known_sdf=values))
     rows = np.lexsort(known.T), np.lexsort(ordered.known.T)
     np.testing.assert_array_equal(known[rows[0]], ordered.known[rows[1]])
@@ -127,7 +131,7 @@ def test_poses_come_in_the_order_of_their_plain_scores():
     free = lattice.reshape(-1, 3)
     free = free[free[:, 0] < 0.18]
     poses = drawn(KnownPoints(free=free, known=CONTACTS), AnchorSettings())
-    contacts = np.minimum(np.abs(distances(poses, CONTACTS, "nearest")), 0.06).mean(axis=1)
+    contacts = np.minimum(np.abs(distances(poses, CONTACTS, lookup="nearest")), 0.06).mean(axis=1)
     nodes = np.argwhere(BOX_GRID.values <= 0.3 * BOX_GRID.values.min())
     depths = -BOX_GRID.values[tuple(nodes.T)]
     costs = 5.0 * depths + 20.0 * np.maximum(depths - min(0.015, 0.5 * depths.max()), 0.0)
@@ -146,12 +150,12 @@ def test_the_worst_contact_can_be_left_out():
     contacts = CONTACTS[:6] + np.array([[0.0, 0.0, 0.08]] + [[0.0, 0.0, 0.0]] * 5)
     values = np.array([0.0, 0.0, 0.01, -0.01, 0.005, 0.0])
     points = KnownPoints(known=contacts, known_sdf=values)
-    poses = drawn(points, AnchorSettings(), 20_000, 300, left_out=1)
-    costs = np.minimum(np.abs(distances(poses, contacts, "nearest") - values), 0.06)
+    poses = drawn(points, AnchorSettings(), samples=20_000, most=300, left_out=1)
+    costs = np.minimum(np.abs(distances(poses, contacts, lookup="nearest") - values), 0.06)
     trimmed = costs.sum(axis=1) - costs.max(axis=1)
     np.testing.assert_allclose(trimmed, np.sort(trimmed), atol=6 * UNIT)
-    others = drawn(points, AnchorSettings(), 20_000, 3000)
-    costs = np.minimum(np.abs(distances(others, contacts, "nearest") - values), 0.06)
+    others = drawn(points, AnchorSettings(), samples=20_000, most=3000)
+    costs = np.minimum(np.abs(distances(others, contacts, lookup="nearest") - values), 0.06)
     total = costs.sum(axis=1)
     np.testing.assert_allclose(total, np.sort(total), atol=0.002)  # many are out of the grid
     assert trimmed[0] < (costs.sum(axis=1) - costs.max(axis=1))[0]
@@ -168,7 +172,9 @@ def posed(points=None, sdf=BOX_GRID):
 
 
 def starts_of(problem):
-    return anchored_starts(problem, search_space(None, problem.sdf), STARTS, 0).matrices
+    return anchored_starts(
+        problem, search_space(None, problem.sdf), settings=STARTS, index=0
+    ).matrices
 
 
 def test_starts_are_nearer_to_the_contacts_than_e_0():

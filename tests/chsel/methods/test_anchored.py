@@ -72,9 +72,9 @@ def anchored(effort=EFFORT, **changes):
     return Anchored(AnchoredSettings(effort=effort, **changes))
 
 
-def registered(method, problem, observer=None):
+def registered(method, problem, *, observer=None):
     """The result, found to be whole: as many rigid poses as E_0 has, with their energies."""
-    search = Search(problem, method.settings, observer or NullObserver())
+    search = Search(problem, method.settings, observer=observer or NullObserver())
     found = search.choose(search.spread(search.minima()))
     assert found.digest == method.register(problem).digest
     assert len(found.object_from_world) == len(problem.initial_set)
@@ -92,7 +92,7 @@ def registered(method, problem, observer=None):
 
 
 def assert_found(found):
-    position, rotation = pose_errors(found.object_from_world[:1], TRUTH, ObjectSymmetry())
+    position, rotation = pose_errors(found.object_from_world[:1], TRUTH, symmetry=ObjectSymmetry())
     assert position[0] < 0.005
     assert rotation[0] < 0.05
 
@@ -109,8 +109,8 @@ def test_poses_are_rated_by_some_contacts_that_are_far_apart(contacts):
     points = most_informative_first(ODD["hundreds"])
     few = replace(points, known=points.known[:contacts], known_sdf=points.sdf[:contacts])
     poses = Poses.of(posed(method).initial_set[:4])
-    found = Search(posed(method, points), method.settings, NullObserver()).energy.of(poses)
-    expected = Energy(posed(method, few), few, noise_model(method.settings.noise)).of(poses)
+    found = Search(posed(method, points), method.settings, observer=NullObserver()).energy.of(poses)
+    expected = Energy(posed(method, few), few, noise=noise_model(method.settings.noise)).of(poses)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
@@ -119,7 +119,7 @@ def test_an_observer_is_shown_poses_of_three_stages_and_one_archive():
     found = method.register(posed(method), watcher)
     stages = [(trace.stage, trace.iteration) for trace in watcher.traces]
     assert stages == [("fit", 0), ("descend", 0), ("spread", 0)]
-    search = Search(posed(method), method.settings, NullObserver())
+    search = Search(posed(method), method.settings, observer=NullObserver())
     for trace in watcher.traces:
         energies = search.energy.of(search_space(None, GRID).poses(trace.vectors))
         np.testing.assert_allclose(trace.cost, energies, rtol=1e-9, atol=1e-9)
@@ -147,7 +147,7 @@ def test_few_contacts_leave_many_distinct_poses():
 def test_candidates_are_minima_and_states_of_walks_twice_as_many_as_hypotheses(states, chains):
     """Twelve walks by the settings, and more where they would give too few."""
     method = anchored(replace(EFFORT, states=states), limit=1e6)
-    search = Search(posed(method, FEW), method.settings, NullObserver())
+    search = Search(posed(method, FEW), method.settings, observer=NullObserver())
     minima = search.minima()
     candidates = search.spread(minima)
     assert len(candidates.energies) == len(minima.energies) + states * chains
@@ -157,7 +157,7 @@ def test_candidates_are_minima_and_states_of_walks_twice_as_many_as_hypotheses(s
 def test_candidates_are_below_the_limit_and_costs_the_plain_formula(points):
     method = anchored(limit=4.0)
     problem = posed(method, points)
-    search = Search(problem, method.settings, NullObserver())
+    search = Search(problem, method.settings, observer=NullObserver())
     minima = search.minima()
     candidates = search.spread(minima)
     assert candidates.energies[0] == candidates.energies.min()
@@ -165,7 +165,7 @@ def test_candidates_are_below_the_limit_and_costs_the_plain_formula(points):
     found = search.choose(candidates)
     assert found.cost[0] == pytest.approx(candidates.energies[0], abs=1e-9)
     poses = Poses.of(found.object_from_world[::3])
-    expected = plain_energies(noise_model(method.settings.noise), GRID, points, poses)
+    expected = plain_energies(noise_model(method.settings.noise), GRID, points=points, poses=poses)
     np.testing.assert_allclose(found.cost[::3], expected, atol=0.01 * len(points.known))
 
 
@@ -202,7 +202,7 @@ def test_a_good_pose_of_the_last_step_is_not_lost():
     problem = posed(method, low_cost_set=inverse(TRUTH)[None])
     assert_found(method.register(problem))
     without = method.register(posed(method))
-    position, _ = pose_errors(without.object_from_world[:1], TRUTH, ObjectSymmetry())
+    position, _ = pose_errors(without.object_from_world[:1], TRUTH, symmetry=ObjectSymmetry())
     assert position[0] > 0.02
 
 
@@ -245,7 +245,8 @@ def test_wrong_free_points_do_not_move_the_best(contacts, spacing):
     inner = inner.reshape(-1, 3)
     depths = -GRID.at(inner, lookup="trilinear")[0]
     wrong = apply(TRUTH, inner[(depths > 0.002) & (depths < 0.5 * SIDE)])[::spacing]
-    method, points = anchored(), known_points(TRUTH, contacts)
+    method = anchored()
+    points = known_points(TRUTH, contacts)
     right = registered(method, posed(method, points))
     points = replace(points, free=np.concatenate([points.free, wrong]))
     found = registered(method, posed(method, points))
@@ -257,22 +258,24 @@ def test_wrong_free_points_do_not_move_the_best(contacts, spacing):
 @pytest.mark.parametrize("contacts", [4, 6, 9])
 def test_the_truth_stays_beside_a_foreign_contact_among_few(contacts):
     """Among the hypotheses, or the rivals of the best, which is not determined if it is wrong."""
-    method, points = Anchored(AnchoredSettings()), known_points(TRUTH, contacts)
+    method = Anchored(AnchoredSettings())
+    points = known_points(TRUTH, contacts)
     foreign = apply(TRUTH, np.array([[0.03, 0.03, 0.16]]))
     known = np.concatenate([points.known, foreign])
     problem = posed(method, KnownPoints(free=points.free, known=known))
     found = method.register(problem)
     poses = Poses.joined([Poses.of(found.object_from_world), method.minima(problem)])
-    off = outline_distances_to(GRID, poses, Poses.of(inverse(TRUTH)[None]))
+    off = outline_distances_to(GRID, poses, other=Poses.of(inverse(TRUTH)[None]))
     assert off.min() < 0.01
-    trust = trust_by(method, problem, found)
+    trust = trust_by(method, problem, hypotheses=found)
     assert trust is not None
     assert off[0] < 0.01 or trust.verdict != "determined"
 
 
 @pytest.mark.parametrize(("contacts", "expected"), [(3, {0}), (4, {0, 1})])
 def test_rounds_of_more_than_three_contacts_leave_one_out_in_turn(monkeypatch, contacts, expected):
-    left_out, best = set(), AnchorSampler.best
+    left_out = set()
+    best = AnchorSampler.best
 
     def watched(*arguments, **named):
         left_out.add(named["left_out"])
@@ -294,22 +297,23 @@ def test_the_twin_of_a_nearly_symmetric_object_is_found_from_the_other():
     turn = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5 * np.pi))
     quarter = compose(turn, centre - turn @ centre)
     both = Poses.of(inverse(np.stack([TRUTH, TRUTH @ quarter])))
-    assert outline_distances_to(sdf, both[:1], both[1:])[0] > 0.002
-    method, start = anchored(replace(EFFORT, samples=1)), np.repeat(both.matrices[:1], 9, axis=0)
+    assert outline_distances_to(sdf, both[:1], other=both[1:])[0] > 0.002
+    method = anchored(replace(EFFORT, samples=1))
+    start = np.repeat(both.matrices[:1], 9, axis=0)
     problem = posed(method, KnownPoints(known=contacts), sdf=sdf, initial_set=start)
     found = Poses.of(registered(method, problem).object_from_world)
     for one in (both[:1], both[1:]):
-        assert outline_distances_to(sdf, found, one).min() < 0.001
+        assert outline_distances_to(sdf, found, other=one).min() < 0.001
     alone = hypotheses_at(start[:1])
     assert trust_in(problem, alone).verdict == "determined"
-    trust = trust_by(build_method("icp"), problem, alone)  # which searches for rivals
+    trust = trust_by(build_method("icp"), problem, hypotheses=alone)  # which searches for rivals
     assert trust is not None
     assert str(trust).startswith("determined up to a turn of ")
 
 
 def test_the_better_poses_are_fitted_and_the_others_stay():
     method = anchored(replace(EFFORT, refined=2))
-    search = Search(posed(method), method.settings, NullObserver())
+    search = Search(posed(method), method.settings, observer=NullObserver())
     before = search.rated(Poses.of(around_truth(6)))
     after = search.refined(before)
     assert (np.diff(after.energies) >= 0.0).all()
@@ -347,9 +351,11 @@ def test_a_foreign_contact_does_not_move_the_best():
 
 def test_updates_on_the_same_points_never_lose_the_best():
     """With a sensor as inexact as the points, so that all energies are of one noise."""
-    method, previous, lowest = anchored(noise=0.003), None, []
+    method = anchored(noise=0.003)
+    previous = None
+    lowest = []
     for _ in range(5):
-        previous = method.register(posed(method, INEXACT, previous))
+        previous = method.register(posed(method, INEXACT, previous=previous))
         lowest.append(previous.cost[0])
     assert (np.diff(lowest) <= 1e-12).all()
 
@@ -361,14 +367,17 @@ def test_a_limit_that_excludes_nearly_all_still_gives_hypotheses():
 
 def test_an_object_of_few_nodes_inside_has_results():
     plate = trimesh.creation.box((0.1, 0.08, 0.011))
-    method, grid = anchored(), SdfGrid.from_mesh(plate, 0.01)
+    method = anchored()
+    grid = SdfGrid.from_mesh(plate, 0.01)
     contacts = apply(TRUTH, np.asarray(trimesh.sample.sample_surface(plate, 5, seed=1)[0]))
     registered(method, posed(method, KnownPoints(known=contacts, free=POINTS.free), sdf=grid))
 
 
 @pytest.mark.filterwarnings("ignore:no node of the SDF:UserWarning")
 def test_a_grid_without_a_node_inside_is_one_clear_error():
-    grid = SdfGrid(GRID.origin, 0.01, np.maximum(GRID.values, 0.001), GRID.gradients)
+    grid = SdfGrid(
+        GRID.origin, 0.01, values=np.maximum(GRID.values, 0.001), gradients=GRID.gradients
+    )
     method = anchored()
     with pytest.raises(ChselError, match="no node of the SDF grid is inside") as raised:
         method.register(posed(method, sdf=grid))
@@ -380,7 +389,7 @@ def test_hypotheses_are_chosen_for_the_least_expected_plausible_diversity(modes,
     count = 6
     problem = posed(anchored(), INEXACT_FEW, initial_set=np.tile(inverse(TRUTH), (count, 1, 1)))
     settings = AnchoredSettings(effort=EFFORT, modes=modes, reach=reach)
-    search = Search(problem, settings, NullObserver())
+    search = Search(problem, settings, observer=NullObserver())
     every = search.spread(search.minima())
     candidates = every.chosen(np.arange(40) * len(every.energies) // 40)
     energies = candidates.energies
@@ -396,7 +405,7 @@ def test_hypotheses_are_chosen_for_the_least_expected_plausible_diversity(modes,
         return total
 
     likely = candidates.poses[: int((energies <= energies[0] + 3.0).sum())]
-    chosen = basin_bests(problem.sdf, likely, modes).tolist()
+    chosen = basin_bests(problem.sdf, likely, most=modes).tolist()
     while len(chosen) < count:
         others = [i for i in range(len(energies)) if i not in chosen]
         chosen.append(min(others, key=lambda i: expected_diversity([*chosen, i])))

@@ -36,7 +36,8 @@ TABLE_ERROR = 0.25**2 / 8.0  # nats a point: of chords of a parabola, a quarter 
 
 def points_with(contacts):
     """Contacts, one of which is outside of the grid and one far off, and points of other kinds."""
-    known, values = contacts_on(BOX, contacts), 0.005 * RANDOM.standard_normal(contacts)
+    known = contacts_on(BOX, contacts)
+    values = 0.005 * RANDOM.standard_normal(contacts)
     return KnownPoints(
         free=np.concatenate([FREE, [[5.0, 0.0, -3.0]]]),
         occupied=OCCUPIED,
@@ -49,7 +50,10 @@ def near_and_far():
     """Most have free voxels in the object, some far more than WRONG allows."""
     places = np.random.default_rng(2).uniform(-0.1, 0.5, (8, 3))
     turns = random_rotations(np.random.default_rng(1), 8)
-    near = [poses_around_truth(8, *by) for by in ((0.003, 0.03), (0.015, 0.1), (0.05, 0.4))]
+    near = [
+        poses_around_truth(8, by[0], turn=by[1])
+        for by in ((0.003, 0.03), (0.015, 0.1), (0.05, 0.4))
+    ]
     return Poses.joined([*near, Poses.of(inverse(compose(turns, places)))])
 
 
@@ -67,9 +71,10 @@ def near_and_far():
 )
 def test_energy_is_the_plain_formula(points, shared):
     """Also of poses that stretch the object."""
-    noise, poses = noise_model(SENSOR, shared), near_and_far()
+    noise = noise_model(SENSOR, shared)
+    poses = near_and_far()
     poses = Poses.joined([poses, Poses(1.5 * poses.numbers)])
-    expected = plain_energies(noise, BOX_GRID, points, poses)
+    expected = plain_energies(noise, BOX_GRID, points=points, poses=poses)
     assert np.ptp(expected) > 1.5 * WRONG
     counted = min(len(points.known), INDEPENDENT)
     found = energy_of(points, noise).of(poses)
@@ -81,8 +86,18 @@ def test_free_points_count_up_to_the_ends_of_a_long_object(axis):
     sdf = SdfGrid.from_mesh(trimesh.creation.box(np.roll([0.5, 0.06, 0.05], axis)), 0.01)
     places = np.roll([[x, 0.028, 0.0] for x in np.linspace(-0.24, 0.24, 25)], axis, axis=1)
     poses = Poses.of(compose(np.tile(np.eye(3), (25, 1, 1)), places))
-    points, noise = KnownPoints(free=np.zeros((1, 3))), noise_model(SENSOR)
-    problem = RegistrationProblem(sdf, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(0, 0))
-    found = Energy(problem, points, noise).of(poses)
-    np.testing.assert_allclose(found, plain_energies(noise, sdf, points, poses), atol=1e-9)
+    points = KnownPoints(free=np.zeros((1, 3)))
+    noise = noise_model(SENSOR)
+    problem = RegistrationProblem(
+        sdf=sdf,
+        points=points,
+        initial_set=np.eye(4)[None],
+        workspace=WORKSPACE,
+        free_resolution=0.03,
+        key=StreamKey(0, 0),
+    )
+    found = Energy(problem, points, noise=noise).of(poses)
+    np.testing.assert_allclose(
+        found, plain_energies(noise, sdf, points=points, poses=poses), atol=1e-9
+    )
     assert found.min() > 0.05

@@ -58,10 +58,22 @@ AROUND = KnownPoints(
 )
 
 
-def chains_of(energy, poses, floor, moves, kept=0, plane=None):
-    space, stream = search_space(plane, BOX_GRID), StreamKey(5, 2).kernel_stream(Purpose.WALKS, 3)
-    stride = stride_of(space, object_centre(BOX_GRID), origin_bounds(WORKSPACE, space, 0.15))
-    return walked(energy, stride, poses, energy.of(poses), floor, moves, stream, kept)
+def chains_of(energy, poses, *, floor, moves, kept=0, plane=None):
+    space = search_space(plane, BOX_GRID)
+    stream = StreamKey(5, 2).kernel_stream(Purpose.WALKS, 3)
+    stride = stride_of(
+        space, object_centre(BOX_GRID), bounds=origin_bounds(WORKSPACE, space, margin=0.15)
+    )
+    return walked(
+        energy,
+        stride,
+        poses=poses,
+        energies=energy.of(poses),
+        floor=floor,
+        moves=moves,
+        stream=stream,
+        kept=kept,
+    )
 
 
 def repeated(world_from_object, count):
@@ -73,7 +85,7 @@ def test_kept_states_are_drawn_from_the_likelihood(plane, dimension, contacts):
     """Of a normal distribution in d dimensions, energies are d / 2 above the least on average."""
     truth = TRUTH if plane is None else STANDING
     energy = energy_of(KnownPoints(known=apply(truth, on_faces(contacts))), NORMAL)
-    chains = chains_of(energy, repeated(truth, 100), 50.0, 1500, 15, plane)
+    chains = chains_of(energy, repeated(truth, 100), floor=50.0, moves=1500, kept=15, plane=plane)
     above = chains.kept_energies[:, 5:] - energy.of(repeated(truth, 1))
     assert above.mean() == pytest.approx(0.5 * dimension, rel=0.08)
     assert above.var() == pytest.approx(0.5 * dimension, rel=0.25)
@@ -88,7 +100,7 @@ def test_energies_that_walks_carry_along_are_those_of_their_poses(points):
     energy = energy_of(points, noise_model(0.0005))
     starts = repeated(TRUTH, 12)
     floor = float(energy.of(starts).max()) + 4.0
-    chains = chains_of(energy, starts, floor, 300, 4)
+    chains = chains_of(energy, starts, floor=floor, moves=300, kept=4)
     for numbers, energies in (
         (chains.poses, chains.energies),
         (chains.kept.reshape(-1, 12), chains.kept_energies.reshape(-1)),
@@ -108,7 +120,9 @@ def test_walks_on_an_oblique_plane_slide_on_it_and_turn_about_its_normal():
     plane = PlaneSettings(axis=tuple(normal), offset=-0.4)
     there = compose(np.eye(3), 0.4 * normal)  # world_from_object
     energy = energy_of(KnownPoints(known=apply(there, on_faces(24))), noise_model(0.002))
-    found = Poses(chains_of(energy, repeated(there, 40), 50.0, 200, 3, plane).poses)
+    found = Poses(
+        chains_of(energy, repeated(there, 40), floor=50.0, moves=200, kept=3, plane=plane).poses
+    )
     np.testing.assert_allclose(found.rotations @ normal, np.tile(normal, (40, 1)), atol=1e-12)
     np.testing.assert_allclose(found.translations @ normal, -0.4, atol=1e-12)
     assert found.translations.std(axis=0).min() > 1e-4
@@ -116,15 +130,16 @@ def test_walks_on_an_oblique_plane_slide_on_it_and_turn_about_its_normal():
 
 
 def test_walks_from_above_come_down_to_a_floor_and_stop():
-    energy, starts = energy_of(AROUND, noise_model(0.0005)), poses_around_truth(12, 0.02, 0.2)
+    energy = energy_of(AROUND, noise_model(0.0005))
+    starts = poses_around_truth(12, 0.02, turn=0.2)
     before = energy.of(starts)
     floor = float(np.sort(before)[3])
-    down = chains_of(energy, starts, floor, 200)
+    down = chains_of(energy, starts, floor=floor, moves=200)
     assert (down.energies <= before).all()
     assert (down.energies <= floor).mean() > 0.7
     np.testing.assert_array_equal(down.poses[before <= floor], starts.numbers[before <= floor])
-    assert chains_of(energy, starts, 0.0, 200).energies.mean() < floor
-    kept = chains_of(energy, starts, -100.0, 20, 2)
+    assert chains_of(energy, starts, floor=0.0, moves=200).energies.mean() < floor
+    kept = chains_of(energy, starts, floor=-100.0, moves=20, kept=2)
     assert np.isinf(kept.kept_energies).all()
 
 
@@ -169,17 +184,17 @@ def off_truth(poses):
 @pytest.mark.parametrize("points", [AT_ODDS, MANY_AT_ODDS], ids=["25", "73"])
 def test_a_fit_ends_where_no_motion_lowers_the_plain_formula(points):
     """Points of all classes disagree there, so that each must have its weight and its sign."""
-    poses = poses_around_truth(6, 0.01, 0.1)
-    found = fitted(energy_of(points, NOISE), TWISTS, poses, 60)
-    before = plain_energies(NOISE, BOX_GRID, points, poses)
-    after = plain_energies(NOISE, BOX_GRID, points, found)
+    poses = poses_around_truth(6, 0.01, turn=0.1)
+    found = fitted(energy_of(points, NOISE), TWISTS, poses=poses, steps=60)
+    before = plain_energies(NOISE, BOX_GRID, points=points, poses=poses)
+    after = plain_energies(NOISE, BOX_GRID, points=points, poses=found)
     assert (after < before - 10.0).all()
 
     def moved(twist):
         angle = np.sqrt((twist[:3] ** 2).sum())
         turn = axis_angle(twist[:3] / max(angle, 1e-9), angle / 0.1)
         pose = Poses.of((compose(turn, twist[3:]) @ found.matrices[0])[None])
-        return float(plain_energies(NOISE, BOX_GRID, points, pose)[0])
+        return float(plain_energies(NOISE, BOX_GRID, points=points, poses=pose)[0])
 
     options = {"xtol": 1e-5, "ftol": 1e-6, "direc": 1e-3 * np.eye(6)}
     least = minimize(moved, np.zeros(6), method="Powell", options=options)
@@ -193,19 +208,24 @@ def test_a_fit_ends_where_no_motion_lowers_the_plain_formula(points):
 def test_a_step_that_goes_far_counts_free_points_that_were_not_near_at_first():
     """Contacts draw the box by 36 mm onto free points that were 32 mm in front of it."""
     rough = NoiseModel((0.015,) * LEVELS, (1.0 / LEVELS,) * LEVELS, softness=0.01, wrong=50.0)
-    grid, halves = SdfGrid.from_mesh(BOX, 0.004), np.array([X, Y, Z])
+    grid = SdfGrid.from_mesh(BOX, 0.004)
+    halves = np.array([X, Y, Z])
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     faces = [signs * np.where(np.arange(3) == axis, 1.0, 0.4) * halves for axis in range(3)]
     across = np.random.default_rng(0).uniform(-0.8, 0.8, (300, 2)) * [Y, Z]
     free = np.column_stack([np.full(300, X - 0.004), across])
     points = KnownPoints(known=apply(TRUTH, np.concatenate(faces)), free=apply(TRUTH, free))
     start = poses_of(turned(0.0, -0.036))
-    energy = Energy(replace(box_problem(points), sdf=grid), most_informative_first(points), rough)
-    before, there = (plain_energies(rough, grid, points, p)[0] for p in (start, poses_of(TRUTH)))
+    energy = Energy(
+        replace(box_problem(points), sdf=grid), most_informative_first(points), noise=rough
+    )
+    before, there = (
+        plain_energies(rough, grid, points=points, poses=p)[0] for p in (start, poses_of(TRUTH))
+    )
     assert there > before + 2.0
     for steps in (1, 2, 4, 8, 30):
-        found = fitted(energy, TWISTS, start, steps)
-        assert plain_energies(rough, grid, points, found)[0] <= before
+        found = fitted(energy, TWISTS, poses=start, steps=steps)
+        assert plain_energies(rough, grid, points=points, poses=found)[0] <= before
     shift = inverse(found.matrices)[0, :3, 3] - inverse(start.matrices)[0, :3, 3]
     assert np.sqrt((shift**2).sum()) == pytest.approx(0.032, abs=0.001)  # up to the free points
 
@@ -214,17 +234,24 @@ def test_fits_by_rough_then_exact_noise_come_from_afar():
     rough = NoiseModel((0.015,) * LEVELS, (1.0 / LEVELS,) * LEVELS, softness=0.01, wrong=50.0)
     points = KnownPoints(known=np.concatenate([apply(TRUTH, on_faces(24)), FOREIGN]))
     energy = energy_of(points, NOISE)
-    poses = poses_around_truth(40, 0.03, 0.3)
-    shift, turn = off_truth(fitted(energy, TWISTS, fitted(energy.by(rough), TWISTS, poses, 20), 30))
+    poses = poses_around_truth(40, 0.03, turn=0.3)
+    shift, turn = off_truth(
+        fitted(
+            energy, TWISTS, poses=fitted(energy.by(rough), TWISTS, poses=poses, steps=20), steps=30
+        )
+    )
     arrived = (shift < 0.001) & (turn < 0.01)
     assert arrived.mean() > 0.8
     assert (np.array(off_truth(poses)) > [[0.029], [0.29]]).all()
 
 
 def test_no_fit_raises_an_energy_and_none_of_no_steps_moves():
-    energy, poses = energy_of(AT_ODDS, NOISE), poses_around_truth(40, 0.1, 1.5)
-    assert (energy.of(fitted(energy, TWISTS, poses, 4)) <= energy.of(poses)).all()
-    np.testing.assert_array_equal(fitted(energy, TWISTS, poses, 0).numbers, poses.numbers)
+    energy = energy_of(AT_ODDS, NOISE)
+    poses = poses_around_truth(40, 0.1, turn=1.5)
+    assert (energy.of(fitted(energy, TWISTS, poses=poses, steps=4)) <= energy.of(poses)).all()
+    np.testing.assert_array_equal(
+        fitted(energy, TWISTS, poses=poses, steps=0).numbers, poses.numbers
+    )
 
 
 def test_on_a_plane_fits_stay_on_it_and_come_to_where_the_object_stands():
@@ -233,7 +260,7 @@ def test_on_a_plane_fits_stay_on_it_and_come_to_where_the_object_stands():
     turned_by = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.1)) @ STANDING[:3, :3]
     starts = compose(np.tile(turned_by, (3, 1, 1)), STANDING[:3, 3] + off)
     energy = energy_of(KnownPoints(known=apply(STANDING, on_faces(24))), NOISE)
-    found = fitted(energy, twists_of(space, CENTRE), Poses.of(inverse(starts)), 30)
+    found = fitted(energy, twists_of(space, CENTRE), poses=Poses.of(inverse(starts)), steps=30)
     there = np.tile(STANDING, (3, 1, 1))
     np.testing.assert_allclose(inverse(found.matrices), there, atol=1e-3)
     again = space.poses(space.encode(found))
@@ -245,7 +272,7 @@ def test_a_step_of_a_fit_is_at_most_80_mm_and_half_a_radian():
     rough = NoiseModel((0.3,) * LEVELS, (1.0 / LEVELS,) * LEVELS)
     energy = energy_of(KnownPoints(known=apply(TRUTH, on_faces(24))), rough)
     far = poses_of(turned(0.0, 0.25), turned(1.4))
-    steps = fitted(energy, TWISTS, far, 1).matrices @ inverse(far.matrices)
+    steps = fitted(energy, TWISTS, poses=far, steps=1).matrices @ inverse(far.matrices)
     shift = apply(steps[0], CENTRE[None])[0] - CENTRE
     assert np.sqrt((shift**2).sum()) == pytest.approx(0.08)
     assert rotation_angle(steps[1:, :3, :3])[0] == pytest.approx(2.0 * math.atan(0.25))
@@ -254,10 +281,14 @@ def test_a_step_of_a_fit_is_at_most_80_mm_and_half_a_radian():
 @pytest.mark.parametrize("known_points", [AT_ODDS, MANY_AT_ODDS], ids=["25", "73"])
 def test_a_step_of_a_fit_is_that_of_levenberg_and_marquardt(known_points):
     """By the normal equations in numpy, of turns by 1 rad and shifts by 0.15 m about a point."""
-    sigma, softness, pivot = 0.3, 0.2, np.array([0.03, -0.05, 0.02])
+    sigma = 0.3
+    softness = 0.2
+    pivot = np.array([0.03, -0.05, 0.02])
     wide = NoiseModel((sigma,) * LEVELS, (1.0 / LEVELS,) * LEVELS, softness=softness)
-    poses = poses_around_truth(5, 0.005, 0.05)
-    found = fitted(energy_of(known_points, wide), twists_of(SE3Space(), pivot), poses, 1)
+    poses = poses_around_truth(5, 0.005, turn=0.05)
+    found = fitted(
+        energy_of(known_points, wide), twists_of(SE3Space(), pivot), poses=poses, steps=1
+    )
     points = np.concatenate([known_points.known, known_points.free, known_points.occupied])
     known, free = len(known_points.known), len(known_points.free)
     for before, after in zip(poses.matrices, found.matrices, strict=True):
@@ -270,7 +301,8 @@ def test_a_step_of_a_fit_is_that_of_levenberg_and_marquardt(known_points):
         weights[known : known + free] *= residuals[known : known + free] < 0.0
         weights[known + free :] *= residuals[known + free :] > 0.0
         rates = np.hstack([np.cross(places - pivot, normals) / 0.15, normals])
-        normal, right = rates.T @ (weights[:, None] * rates), rates.T @ (weights * residuals)
+        normal = rates.T @ (weights[:, None] * rates)
+        right = rates.T @ (weights * residuals)
         step = -np.linalg.solve(normal + 0.01 * np.trace(normal) / 6.0 * np.eye(6), right)
         turn, shift = step[:3] / 0.15, step[3:]
         half = math.sqrt(turn @ turn) / 2.0
@@ -284,11 +316,23 @@ def test_moves_turn_about_a_contact_or_the_centre_and_shift():
     """By normal sizes times 10^U(-0.9, 0.3); 6 rad go with a metre, 3 of 5 turn about a contact."""
     contacts = np.array([[0.1, 0.0, 0.0], [-0.1, 0.05, 0.0], [0.0, 0.0, 0.3]])
     flat = NoiseModel((1e3,) * LEVELS, (1.0 / LEVELS,) * LEVELS)
-    energy, count = energy_of(KnownPoints(known=apply(TRUTH, contacts)), flat), 40_000
-    space, middle = SE3Space(), TRUTH[:3, 3]
-    stride = stride_of(space, CENTRE, (middle - 9.0, middle + 9.0))
-    starts, stream = repeated(TRUTH, count), StreamKey(5, 2).kernel_stream(Purpose.WALKS, 3)
-    chains = walked(energy, stride, starts, energy.of(starts), np.inf, 1, stream, 1)
+    energy = energy_of(KnownPoints(known=apply(TRUTH, contacts)), flat)
+    count = 40_000
+    space = SE3Space()
+    middle = TRUTH[:3, 3]
+    stride = stride_of(space, CENTRE, bounds=(middle - 9.0, middle + 9.0))
+    starts = repeated(TRUTH, count)
+    stream = StreamKey(5, 2).kernel_stream(Purpose.WALKS, 3)
+    chains = walked(
+        energy,
+        stride,
+        poses=starts,
+        energies=energy.of(starts),
+        floor=np.inf,
+        moves=1,
+        stream=stream,
+        kept=1,
+    )
     moves = Poses(chains.poses).matrices @ TRUTH
     turns = moves[:, :3, :3]
     skew = (turns - np.swapaxes(turns, 1, 2)) / (1.0 + np.trace(turns, axis1=1, axis2=2))[

@@ -16,7 +16,7 @@ def test_weights_and_prices_are_the_mean_diversity_of_any_hypotheses(reach):
     assert len(np.unique(energies)) < 12
     for count in (1, 2, 5):
         chosen = random.permutation(12)[:count]
-        weights, prices = weights_and_prices(squared, energies, reach, count)
+        weights, prices = weights_and_prices(squared, energies, reach=reach, count=count)
         total = (weights * squared[:, chosen].min(axis=1)).sum() + prices[chosen].sum()
         diversities = []
         for energy in energies:

@@ -25,22 +25,22 @@ QUICK = ChselSettings(
 def algorithm(**changes):
     """Algorithm 1 on the problem of the L."""
     method = Chsel(replace(QUICK, **changes))
-    return chsel._Algorithm1(posed(method, POINTS), method.settings, NullObserver())
+    return chsel._Algorithm1(posed(method, POINTS), method.settings, observer=NullObserver())
 
 
 def test_every_pass_searches_again_around_the_best_of_the_last(monkeypatch):
     given, fill = [], chsel.fill_archive
 
-    def watched(*arguments):
-        given.append(arguments)
-        fill(*arguments)
+    def watched(*arguments, **named):
+        given.append(named["refinement"])
+        fill(*arguments, **named)
 
     monkeypatch.setattr(chsel, "fill_archive", watched)
     method = Chsel(replace(QUICK, passes=3))
     watcher = Watcher(snapshot_interval=4)
     found = method.register(posed(method, POINTS), watcher)
     assert [archive.refinement for archive in watcher.archives] == [0, 0, 1, 1, 2, 2]
-    assert [arguments[-1] for arguments in given] == [0, 1, 2]
+    assert given == [0, 1, 2]
     assert found.archive is not None
     assert found.archive.refinement == 2
 
@@ -57,7 +57,8 @@ def test_a_further_pass_starts_with_the_best_fifth_and_normal_draws_around_it(co
     if len(best) == 1:
         np.testing.assert_allclose(drawn, np.tile(best, (count, 1)), atol=1e-12)
     else:
-        shifts, wanted = drawn[len(best) :, 6:], best[:, 6:]
+        shifts = drawn[len(best) :, 6:]
+        wanted = best[:, 6:]
         np.testing.assert_allclose(shifts.mean(axis=0), wanted.mean(axis=0), atol=0.002)
         np.testing.assert_allclose(shifts.std(axis=0), wanted.std(axis=0, ddof=1), rtol=0.06)
 
@@ -65,12 +66,15 @@ def test_a_further_pass_starts_with_the_best_fifth_and_normal_draws_around_it(co
 @pytest.mark.parametrize("start", ["best", "initial"])
 def test_the_search_starts_from_the_best_cell_or_the_first_pose_of_e_0(monkeypatch, start):
     given = []
-    monkeypatch.setattr(chsel, "fill_archive", lambda *arguments: given.append(arguments))
+    monkeypatch.setattr(
+        chsel, "fill_archive", lambda *values, **named: given.append((*values, named))
+    )
     method = Chsel(replace(QUICK, emitter=EmitterSettings(iterations=4, start=start)))
     problem = posed(method, POINTS, initial_set=around_truth(7))
     method.register(problem)
-    _, objective, archive, vector, count, *_ = given[0]
-    last = archive.snapshot(0, 0)
+    _, objective, named = given[0]
+    vector, count = named["start"], named["count"]
+    last = named["archive"].snapshot(0, 0)
     expected = last.solutions[np.argmax(last.objectives)]
     if start == "initial":
         expected = objective.space.encode(Poses.of(problem.initial_set))[0]

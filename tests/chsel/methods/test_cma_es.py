@@ -73,9 +73,10 @@ def objective(kind):
     )
 
 
-def runs_on(kind, settings, starts, observer=None):
-    key, observer = StreamKey(0, 0), observer or NullObserver()
-    return run_all(objective(kind), starts, settings, key, observer)
+def runs_on(kind, settings, *, starts, observer=None):
+    key = StreamKey(0, 0)
+    observer = observer or NullObserver()
+    return run_all(objective(kind), starts, settings=settings, key=key, observer=observer)
 
 
 # Median evaluations of cma 4.5.0 over 21 seeds, population 10 and positive weights, until a cost
@@ -88,8 +89,9 @@ def test_it_needs_about_as_many_evaluations_as_the_cma_package(
     kind, start, sigma0, theirs, monkeypatch
 ):
     monkeypatch.setattr(medial_constraint, "_BLOCK", 1)  # traces every generation
-    settings, watcher = replace(UNENDING, sigma0=sigma0, generations=900), Watcher()
-    runs = runs_on(kind, settings, np.full((21, D), start), watcher)
+    settings = replace(UNENDING, sigma0=sigma0, generations=900)
+    watcher = Watcher()
+    runs = runs_on(kind, settings, starts=np.full((21, D), start), observer=watcher)
     assert all(run.cost[0] <= 1e-9 for run in runs)
     reached = np.array([trace.cost <= 1e-9 for trace in watcher.traces])  # (generations, runs)
     evaluations = 10 * np.argmax(reached, axis=0)
@@ -99,25 +101,26 @@ def test_it_needs_about_as_many_evaluations_as_the_cma_package(
 def test_the_best_is_the_lowest_cost_met_and_the_start_counts():
     lowest = []
     for generations in range(1, 31):
-        (run,) = runs_on(SPHERE, replace(UNENDING, generations=generations), np.ones((1, D)))
+        (run,) = runs_on(SPHERE, replace(UNENDING, generations=generations), starts=np.ones((1, D)))
         lowest.append(run.batch.objectives.min())
         assert run.cost[0] == min(lowest)
     assert run.cost[0] == cost_of(Landscape(SPHERE), 0, run.best, 0)
-    (run,) = runs_on(SPHERE, replace(UNENDING, generations=3), np.zeros((1, D)))
+    (run,) = runs_on(SPHERE, replace(UNENDING, generations=3), starts=np.zeros((1, D)))
     np.testing.assert_array_equal(run.best, 0.0)
     assert run.cost[0] == 0.0
 
 
 def test_every_start_draws_from_a_stream_of_its_own():
-    settings, starts = replace(UNENDING, generations=120), np.tile(np.ones(D), (3, 1))
-    three = runs_on(SPHERE, settings, starts)
-    alone = runs_on(SPHERE, settings, starts[:1])
+    settings = replace(UNENDING, generations=120)
+    starts = np.tile(np.ones(D), (3, 1))
+    three = runs_on(SPHERE, settings, starts=starts)
+    alone = runs_on(SPHERE, settings, starts=starts[:1])
     np.testing.assert_array_equal(three[0].best, alone[0].best)
     assert len({tuple(run.best) for run in three}) == 3
 
 
 def ended_at(kind, **changes):
-    (run,) = runs_on(kind, replace(UNENDING, **changes), np.ones((1, D)))
+    (run,) = runs_on(kind, replace(UNENDING, **changes), starts=np.ones((1, D)))
     return int(run.generations[0]), run
 
 
@@ -137,7 +140,7 @@ def test_tolfun_ends_a_run_when_no_cost_of_a_generation_is_far_above_the_lowest(
 
 def test_generations_end_a_run_and_none_at_all_leaves_the_start():
     assert ended_at(ROSENBROCK, generations=17)[0] == 17
-    (run,) = runs_on(SPHERE, replace(UNENDING, generations=0), np.ones((1, D)))
+    (run,) = runs_on(SPHERE, replace(UNENDING, generations=0), starts=np.ones((1, D)))
     np.testing.assert_array_equal(run.best, 1.0)
 
 
@@ -159,7 +162,9 @@ def test_populations_and_generations_are_those_of_pycma():
 def test_a_single_run_gives_samples_of_its_last_distribution():
     settings = CmaEsSettings(starts="single", tolfun=1e-5)
     starts = np.concatenate([np.ones((1, D)), np.full((29, D), 50.0)])
-    found = evolved(objective(SPHERE), starts, settings, StreamKey(0, 0), NullObserver())
+    found = evolved(
+        objective(SPHERE), starts, settings=settings, key=StreamKey(0, 0), observer=NullObserver()
+    )
     assert found.shape == (30, D)
     assert len(np.unique(found, axis=0)) == 30
     assert (np.abs(found) < 0.05).all()

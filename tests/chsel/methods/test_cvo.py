@@ -49,7 +49,7 @@ def scene(count=60):
 def product_of(points, sdf=SDF):
     """The inner product by fields, with a surface band of a voxel."""
     parts = ("free", points.free), ("surface", points.contacts)
-    fields = {name: class_field(sdf, KERNEL, sdf.resolution, name) for name, _ in parts}
+    fields = {name: class_field(sdf, KERNEL, band=sdf.resolution, name=name) for name, _ in parts}
     return tuple(ClassTerm(part.T.copy(), fields[name]) for name, part in parts)
 
 
@@ -61,7 +61,8 @@ class DenseClouds:
 
     def __init__(self, points, sdf=SDF):
         nodes = sdf.origin + np.argwhere(sdf.values > -np.inf) * sdf.resolution
-        values, band = sdf.values.reshape(-1), sdf.resolution
+        values = sdf.values.reshape(-1)
+        band = sdf.resolution
         surface = np.abs(values) <= band
         self.pairs = (points.free, nodes[values > band]), (points.contacts, nodes[surface])
 
@@ -86,7 +87,7 @@ def kernel(x, z):
     return KERNEL.amplitude * np.exp(-apart / (2.0 * KERNEL.ell**2))
 
 
-def along(object_from_world, xi, tau):
+def along(object_from_world, xi, *, tau):
     """G Exp(tau xi), the exponential by its series."""
     twist = np.zeros((4, 4))
     twist[:3, :3] = np.cross(np.eye(3), tau * xi[:3])
@@ -98,7 +99,7 @@ def along(object_from_world, xi, tau):
     return object_from_world @ total
 
 
-def nearby(count, seed, reach=0.08):
+def nearby(count, seed, *, reach=0.08):
     """Transforms (count, 4, 4) around the identity."""
     stream = np.random.default_rng(seed)
     turns = rotation_vector(stream.normal(0.0, 0.6, (count, 3)))
@@ -115,12 +116,19 @@ def flows(product, poses, out):
 
 
 WORKSPACE = Workspace((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3))
-ASCENT = Ascent(1e-4, 0.8, (0.0, 0.0, 0.0), 7.0, 7.0, -1.0)
+ASCENT = Ascent(1e-4, 0.8, centre=(0.0, 0.0, 0.0), c=7.0, d=7.0, stop_below=-1.0)
 QUICK = CvoSettings(ell_min=0.1, c=7.0, origin="world", max_iterations=12)
 
 
-def problem(points, initial_set, workspace=WORKSPACE):
-    return RegistrationProblem(SDF, points, initial_set, workspace, 0.02, StreamKey(0, 0))
+def problem(points, initial_set, *, workspace=WORKSPACE):
+    return RegistrationProblem(
+        sdf=SDF,
+        points=points,
+        initial_set=initial_set,
+        workspace=workspace,
+        free_resolution=0.02,
+        key=StreamKey(0, 0),
+    )
 
 
 def values(product, transforms):
@@ -147,25 +155,29 @@ def test_a_step_is_the_exponential_of_the_flow(tau):
     for xi in (turning / np.sqrt((turning**2).sum()), np.array([0.0, 0, 0, 0.6, 0, 0.8])):
         start = nearby(1, 3)[0]
         found = np.array(moved_along(tuple(Poses.of(start[None]).numbers[0]), tuple(xi), tau))
-        expected = along(start, xi, tau)
+        expected = along(start, xi, tau=tau)
         np.testing.assert_allclose(found, Poses.of(expected[None]).numbers[0], rtol=0, atol=1e-15)
 
 
 def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion():
     points = scene()
-    dense, product, gains = DenseClouds(points), product_of(points), []
+    dense = DenseClouds(points)
+    product = product_of(points)
+    gains = []
     near = np.linspace(-0.05, 0.05, 9)
     for start in nearby(8, 6):
         before = values(product, start[None])[0]
         climbers = climbers_at(product, Poses.of(start[None]).numbers)
-        climb(product, ASCENT, climbers, 1, 0, 1, None)
+        climb(product, ASCENT, climbers=climbers, iterations=1, first=0, last=1, _=None)
         xi = flow(product, start[None])[0]
         xi /= np.sqrt((xi**2).sum())
-        expansion = np.polyfit(near, [dense.product(along(start, xi, tau)) for tau in near], 8)[-5:]
+        expansion = np.polyfit(near, [dense.product(along(start, xi, tau=tau)) for tau in near], 8)[
+            -5:
+        ]
         roots = np.roots(np.polyder(expansion))
         real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0.0)]
         tau = np.clip(real.min(initial=0.8), 1e-4, 0.8)
-        theirs = values(product, along(start, xi, tau)[None])[0]
+        theirs = values(product, along(start, xi, tau=tau)[None])[0]
         gains.append((climbers.value[0] - before, theirs - before))
     ours, theirs = np.array(gains).T
     assert (ours >= 0.99 * theirs).all()
@@ -174,18 +186,20 @@ def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion():
 
 
 def test_the_inner_product_never_falls_and_is_that_of_the_pose():
-    product, starts = product_of(scene()), nearby(5, 7, 0.2)
+    product = product_of(scene())
+    starts = nearby(5, 7, reach=0.2)
     climbers = climbers_at(product, Poses.of(starts).numbers)
     for _ in range(30):
         before = climbers.value.copy()
-        climb(product, ASCENT, climbers, 1, 0, 5, None)
+        climb(product, ASCENT, climbers=climbers, iterations=1, first=0, last=5, _=None)
         assert (climbers.value >= before).all()
         assert ((climbers.value > before) | climbers.done).all()
         np.testing.assert_array_equal(values_of(product, climbers.poses), climbers.value)
 
 
 def test_the_cost_is_one_minus_the_cosine_of_the_two_clouds():
-    points, starts = scene(), nearby(3, 8)
+    points = scene()
+    starts = nearby(3, 8)
     found = Cvo(replace(preset_settings("cvo", "paper"), max_iterations=2)).register(
         problem(points, starts)
     )
@@ -212,14 +226,14 @@ def touched_all_over():
 
 
 def around_truth(count):
-    noise = inverse(nearby(count, 9, 0.03))
+    noise = inverse(nearby(count, 9, reach=0.03))
     return inverse(np.einsum("ij,bjk->bik", WORLD_FROM_OBJECT, noise))
 
 
 def test_without_free_space_contacts_all_over_place_the_object():
     method = Cvo(preset_settings("cvo_no_free_space"))
     found = method.register(problem(touched_all_over(), around_truth(8)))
-    position, _ = pose_errors(found.object_from_world, WORLD_FROM_OBJECT, ObjectSymmetry())
+    position, _ = pose_errors(found.object_from_world, WORLD_FROM_OBJECT, symmetry=ObjectSymmetry())
     assert position[0] < 0.004
     assert found.cost[0] < 0.05
 
@@ -228,8 +242,8 @@ def test_an_object_in_a_hole_of_free_space_ends_up_there():
     method: Method = Cvo(replace(preset_settings("cvo"), balanced=True))
     starts = around_truth(4)
     found = method.register(problem(touched_all_over(), starts))
-    before, _ = pose_errors(starts, WORLD_FROM_OBJECT, ObjectSymmetry())
-    after, _ = pose_errors(found.object_from_world, WORLD_FROM_OBJECT, ObjectSymmetry())
+    before, _ = pose_errors(starts, WORLD_FROM_OBJECT, symmetry=ObjectSymmetry())
+    after, _ = pose_errors(found.object_from_world, WORLD_FROM_OBJECT, symmetry=ObjectSymmetry())
     assert after.max() < 0.01 < before.min()
 
 
@@ -256,14 +270,15 @@ def test_a_start_that_meets_no_point_stays_where_it_is():
     starts[1, :3, 3] += 5.0
     shifted = Workspace((-1.0, -0.3, -0.3), (0.3, 0.3, 0.3))
     settings = replace(QUICK, origin="workspace")
-    found = Cvo(settings).register(problem(scene(), starts, shifted))
+    found = Cvo(settings).register(problem(scene(), starts, workspace=shifted))
     np.testing.assert_array_equal(found.object_from_world[-1], starts[1])
     assert found.cost[-1] == 1.0
     assert found.cost[1] < 0.9
 
 
 def test_each_start_climbs_as_if_it_were_alone_on_any_number_of_threads():
-    points, starts = scene(), nearby(5, 13, 0.2)
+    points = scene()
+    starts = nearby(5, 13, reach=0.2)
     with threads(2):
         together = Cvo(QUICK).register(problem(points, starts))
     alone = [Cvo(QUICK).register(problem(points, start[None])) for start in starts]
@@ -286,7 +301,8 @@ def test_the_length_scale_falls_from_ascent_to_ascent():
 
 
 def test_turning_about_the_workspace_the_place_of_the_world_does_not_matter():
-    points, starts = scene(), nearby(3, 16)
+    points = scene()
+    starts = nearby(3, 16)
     shift = np.array([3.0, -2.0, 1.0])
     away = KnownPoints(free=points.free + shift, known=points.known + shift)
     shifted = starts.copy()
@@ -294,14 +310,15 @@ def test_turning_about_the_workspace_the_place_of_the_world_does_not_matter():
     elsewhere = Workspace((2.7, -2.3, 0.7), (3.3, -1.7, 1.3))
     settings = replace(QUICK, origin="workspace")
     here = Cvo(settings).register(problem(points, starts))
-    there = Cvo(settings).register(problem(away, shifted, elsewhere))
+    there = Cvo(settings).register(problem(away, shifted, workspace=elsewhere))
     np.testing.assert_allclose(there.cost, here.cost, rtol=0, atol=1e-9)
-    in_world = Cvo(QUICK).register(problem(away, shifted, elsewhere))
+    in_world = Cvo(QUICK).register(problem(away, shifted, workspace=elsewhere))
     assert np.abs(in_world.cost - here.cost).max() > 1e-6
 
 
 def test_balanced_contacts_weigh_as_much_as_free_points():
-    points, starts = scene(60), nearby(3, 17)
+    points = scene(60)
+    starts = nearby(3, 17)
     thrice = KnownPoints(free=points.free, known=np.repeat(points.known, 3, axis=0))
     balanced = Cvo(replace(QUICK, balanced=True)).register(problem(points, starts))
     repeated = Cvo(QUICK).register(problem(thrice, starts))
@@ -313,7 +330,8 @@ def test_balanced_contacts_weigh_as_much_as_free_points():
 
 
 def test_a_field_gives_what_the_sum_over_all_pairs_gives():
-    points, transforms = scene(), nearby(6, 0)
+    points = scene()
+    transforms = nearby(6, 0)
     dense, product = DenseClouds(points), product_of(points)
     expected = np.array([dense.product(transform) for transform in transforms])
     most = dense.product(np.eye(4))
@@ -334,7 +352,8 @@ def test_at_the_nodes_a_field_is_the_sum_but_for_its_truncation():
 
 def test_a_coarser_field_stands_for_a_fine_grid_all_the_same():
     fine = SdfGrid.from_mesh(trimesh.creation.box([0.06, 0.04, 0.03]), 0.004, padding=0.02)
-    points, transforms = scene(60), nearby(4, 5)
+    points = scene(60)
+    transforms = nearby(4, 5)
     dense, product = DenseClouds(points, fine), product_of(points, fine)
     assert product[0].field.box.inverse == pytest.approx(1.0 / 0.008)
     expected = np.array([dense.product(transform) for transform in transforms])
@@ -345,13 +364,15 @@ def test_a_coarser_field_stands_for_a_fine_grid_all_the_same():
 @pytest.mark.parametrize("count", [50, 2100])
 def test_the_norm_of_a_cloud_is_the_sum_over_its_pairs(count):
     points = np.random.default_rng(0).uniform(-0.2, 0.3, (count, 3))
-    assert cloud_norm(points, KERNEL, 0.01) == pytest.approx(kernel(points, points).sum(), 1e-12)
+    assert cloud_norm(points, KERNEL, lattice=0.01) == pytest.approx(
+        kernel(points, points).sum(), 1e-12
+    )
 
 
 def test_the_norm_of_lattice_points_is_that_of_a_field_at_its_nodes():
     lattice = np.indices((14, 15, 16)).reshape(3, -1).T
     points = (lattice * 0.0228)[np.random.default_rng(0).random(len(lattice)) < 0.9] + 0.1234
-    found = cloud_norm(points, KERNEL, 0.0228)
+    found = cloud_norm(points, KERNEL, lattice=0.0228)
     assert found == pytest.approx(kernel(points, points).sum(), 1e-3)
 
 
@@ -359,13 +380,13 @@ def test_the_norm_of_lattice_points_is_that_of_a_field_at_its_nodes():
 def test_a_cube_of_points_is_as_good_as_its_points(spacing):
     lattice = (np.indices((20, 20, 20)).reshape(3, -1).T - 10.0) * spacing
     points = lattice[~(np.abs(lattice) < 4.5 * spacing).all(axis=1)]
-    alone, centres, wide = full_cubes(points, KERNEL, spacing)
+    alone, centres, wide = full_cubes(points, KERNEL, lattice=spacing)
     side = 5 if spacing == 0.01 else 2
     assert len(alone) + side**3 * len(centres) == len(points)
     assert len(alone) < 0.6 * len(points)
-    field = class_field(SDF, KERNEL, 0.01, "free")
+    field = class_field(SDF, KERNEL, band=0.01, name="free")
     all_alone = (ClassTerm(points.T.copy(), field),)
-    cubes = ClassTerm(centres.T.copy(), class_field(SDF, wide, 0.01, "free"))
+    cubes = ClassTerm(centres.T.copy(), class_field(SDF, wide, band=0.01, name="free"))
     with_cubes = ClassTerm(alone.T.copy(), field), cubes
     transforms = nearby(5, 2)
     expected, wanted = values(all_alone, transforms), flow(all_alone, transforms)
@@ -377,9 +398,9 @@ def test_a_cube_of_points_is_as_good_as_its_points(spacing):
 def test_cubes_are_made_of_full_lattices_alone():
     off = np.random.default_rng(0).uniform(-0.2, 0.2, (3000, 3))
     for points in (off, off[:5], np.zeros((0, 3))):
-        alone, centres, _ = full_cubes(points, KERNEL, 0.01)
+        alone, centres, _ = full_cubes(points, KERNEL, lattice=0.01)
         np.testing.assert_array_equal(alone, points)
         assert len(centres) == 0
     twice = np.tile(np.indices((20, 20, 4)).reshape(3, -1).T * 0.02, (2, 1))
-    alone, centres, _ = full_cubes(twice, KERNEL, 0.02)
+    alone, centres, _ = full_cubes(twice, KERNEL, lattice=0.02)
     assert len(alone) + 2**3 * len(centres) == len(twice)

@@ -29,10 +29,15 @@ DENSE = IcpSettings(surface_points=5000)
 KEY = StreamKey(5, 2)
 
 
-def posed(known=CONTACTS, initial_set=None, key=KEY, **points):
+def posed(known=CONTACTS, initial_set=None, *, key=KEY, **points):
     initial_set = around_truth(angle=0.4) if initial_set is None else initial_set
     return RegistrationProblem(
-        GRID, KnownPoints(known=known, **points), initial_set, WORKSPACE, 0.02, key
+        sdf=GRID,
+        points=KnownPoints(known=known, **points),
+        initial_set=initial_set,
+        workspace=WORKSPACE,
+        free_resolution=0.02,
+        key=key,
     )
 
 
@@ -65,7 +70,8 @@ def test_every_iteration_is_that_of_trimesh():
 
 def test_where_it_converges_is_where_trimesh_does():
     problem = posed()
-    model, kept = Icp().surface(problem), Watcher()
+    model = Icp().surface(problem)
+    kept = Watcher()
     found = Icp(IcpSettings(stop_below=0.0)).register(problem, kept)
     theirs = [
         trimesh.registration.icp(
@@ -81,7 +87,7 @@ def test_where_it_converges_is_where_trimesh_does():
 
 def test_the_object_is_found_where_it_was_touched_all_over():
     found = Icp(DENSE).register(posed())
-    position, rotation = pose_errors(found.object_from_world, TRUTH, ObjectSymmetry())
+    position, rotation = pose_errors(found.object_from_world, TRUTH, symmetry=ObjectSymmetry())
     assert position[0] < 0.005
     assert rotation[0] < 0.05
 
@@ -90,12 +96,23 @@ def test_exact_touches_of_a_large_object_are_met_to_two_millimetres():
     """Their true residual is 0; with points of the surface too far apart it is 3.4 mm."""
     sides = np.array([0.2, 0.15, 0.22])
     box = trimesh.creation.box(sides)
-    sdf, touches = SdfGrid.from_mesh(box, 0.01), KnownPoints(known=contacts_on(box, 40))
-    method, residuals = Icp(), []
+    sdf = SdfGrid.from_mesh(box, 0.01)
+    touches = KnownPoints(known=contacts_on(box, 40))
+    method = Icp()
+    residuals = []
     for seed in range(9):
         key = StreamKey(seed, 0)
         starts = around_truth(angle=0.1)
-        found = method.register(RegistrationProblem(sdf, touches, starts, WORKSPACE, 0.02, key))
+        found = method.register(
+            RegistrationProblem(
+                sdf=sdf,
+                points=touches,
+                initial_set=starts,
+                workspace=WORKSPACE,
+                free_resolution=0.02,
+                key=key,
+            )
+        )
         touched = apply(found.object_from_world[0], touches.known)
         residuals.append(np.abs(box_distance(touched, sides)).mean())
     assert np.median(residuals) < 0.002
@@ -115,7 +132,8 @@ def test_it_stops_at_the_first_iteration_in_which_no_start_gains():
             matched = model.data[model.query(apply(pose, CONTACTS))[1]]
             errors.append(np.sqrt(((apply(new, CONTACTS) - matched) ** 2).sum(axis=1).mean()))
         gains.append((np.array(errors) < (1.0 - 1e-3) * before).any())
-        before, poses = np.array(errors), aligned
+        before = np.array(errors)
+        poses = aligned
     assert gains == [True] * (len(every) - 1) + [False]
     np.testing.assert_allclose(last_transforms(kept), every[-1], rtol=0, atol=1e-12)
     assert len(every) % 10 != 0  # so that the stop was within a block
@@ -135,7 +153,7 @@ def test_contacts_alone_count():
 
 
 def test_surface_points_stay_or_change_as_the_preset_says():
-    first, later, other = (posed(key=StreamKey(*key)) for key in ((5, 2), (5, 3), (6, 2)))
+    first, later, other = (posed(key=StreamKey(key[0], key[1])) for key in ((5, 2), (5, 3), (6, 2)))
     presets = (("default", 2000, True), ("paper", 500, False), ("reference", 500, True))
     for preset, count, stays in presets:
         method = Icp(preset_settings("icp", preset))

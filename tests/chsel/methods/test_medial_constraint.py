@@ -43,7 +43,8 @@ def free_voxels(seed, share):
     """Voxels of a 12^3 grid within random balls, some left out."""
     random = np.random.default_rng(seed)
     places = np.indices((12, 12, 12)).reshape(3, -1).T
-    middles, radii = random.uniform(0.0, 12.0, (5, 3)), random.uniform(1.0, 6.0, 5)
+    middles = random.uniform(0.0, 12.0, (5, 3))
+    radii = random.uniform(1.0, 6.0, 5)
     apart = np.sqrt(((places[:, None] - middles[None]) ** 2).sum(axis=2))
     inside = (apart < radii).any(axis=1) & (random.random(len(places)) < share)
     return inside.reshape(12, 12, 12)
@@ -59,7 +60,8 @@ def clearance(free):
 
 def of_brute_force(free, inflation):
     """The largest medial ball that none of the chosen ones covers, again and again."""
-    voxels, radii = np.argwhere(free), clearance(free)
+    voxels = np.argwhere(free)
+    radii = clearance(free)
     apart = SIDE * np.sqrt(((voxels[:, None] - voxels[None]) ** 2).sum(axis=2))
     neighbours = np.abs(voxels[:, None] - voxels[None]).max(axis=2) == 1
     held = neighbours & (apart + radii[:, None] <= radii[None] + 1e-3 * SIDE)
@@ -82,7 +84,9 @@ def test_balls_are_those_of_brute_force(seed, share, inflation):
     free = free_voxels(seed, share)
     if not free.any():
         return
-    found = medial_balls(centres(np.argwhere(free)), WORKSPACE, SIDE, inflation)
+    found = medial_balls(
+        centres(np.argwhere(free)), WORKSPACE, resolution=SIDE, inflation=inflation
+    )
     expected = of_brute_force(free, inflation)
     np.testing.assert_allclose(found.centres, expected.centres, atol=1e-12)
     np.testing.assert_allclose(found.radii, expected.radii, rtol=1e-12)
@@ -91,13 +95,13 @@ def test_balls_are_those_of_brute_force(seed, share, inflation):
 def test_the_order_of_points_and_points_off_the_lattice_change_nothing():
     random = np.random.default_rng(0)
     points = centres(np.argwhere(free_voxels(0, 1.0)))
-    expected = medial_balls(points, WORKSPACE, SIDE, 0.02)
+    expected = medial_balls(points, WORKSPACE, resolution=SIDE, inflation=0.02)
     lowest = points.min(axis=0)
     corners = [points[points[:, axis] == lowest[axis]][:1] for axis in range(3)]
     shifted = points + random.uniform(-0.3 * SIDE, 0.3 * SIDE, points.shape)
     scattered = np.concatenate([np.maximum(shifted, lowest), *corners])
     for others in (points[random.permutation(len(points))], scattered):
-        found = medial_balls(others, WORKSPACE, SIDE, 0.02)
+        found = medial_balls(others, WORKSPACE, resolution=SIDE, inflation=0.02)
         np.testing.assert_array_equal(found.centres, expected.centres)
         np.testing.assert_array_equal(found.radii, expected.radii)
 
@@ -105,30 +109,39 @@ def test_the_order_of_points_and_points_off_the_lattice_change_nothing():
 def test_what_is_beyond_the_workspace_is_not_free():
     voxels = np.argwhere(np.ones((9, 5, 5), dtype=bool))
     half = Workspace(tuple(ORIGIN - 0.1 * SIDE), tuple(ORIGIN + SIDE * np.array([4.0, 9.0, 9.0])))
-    found = medial_balls(centres(voxels), half, SIDE, 0.02)
-    expected = medial_balls(centres(voxels[voxels[:, 0] <= 4]), WORKSPACE, SIDE, 0.02)
+    found = medial_balls(centres(voxels), half, resolution=SIDE, inflation=0.02)
+    expected = medial_balls(
+        centres(voxels[voxels[:, 0] <= 4]), WORKSPACE, resolution=SIDE, inflation=0.02
+    )
     np.testing.assert_array_equal(found.centres, expected.centres)
     far = Workspace((3.0, 3.0, 3.0), (4.0, 4.0, 4.0))
     for points, where in ((centres(voxels), far), (np.zeros((0, 3)), WORKSPACE)):
-        assert len(medial_balls(points, where, SIDE, 0.02).radii) == 0
+        assert len(medial_balls(points, where, resolution=SIDE, inflation=0.02).radii) == 0
 
 
 def test_points_over_too_many_voxels_are_an_error_that_says_so():
     points = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
     with pytest.raises(SettingError, match=r"span 1\.0e\+09 voxels of 0\.001 m; accepted"):
-        medial_balls(points, WORKSPACE, 0.001, 0.02)
+        medial_balls(points, WORKSPACE, resolution=0.001, inflation=0.02)
 
 
 RADIUS = 0.1
 IDENTITY = Poses.of(np.eye(4)[None])
 
 
-GRID = ball_grid(RADIUS, 0.01, 15)
+GRID = ball_grid(RADIUS, 0.01, half=15)
 
 
 def problem(points):
     workspace = Workspace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
-    return RegistrationProblem(GRID, points, IDENTITY.matrices, workspace, 0.025, StreamKey(0, 0))
+    return RegistrationProblem(
+        sdf=GRID,
+        points=points,
+        initial_set=IDENTITY.matrices,
+        workspace=workspace,
+        free_resolution=0.025,
+        key=StreamKey(0, 0),
+    )
 
 
 def contacts(count=7):
@@ -142,7 +155,7 @@ def some_balls(count=40):
 
 
 def poses(count=50):
-    return random_poses(np.random.default_rng(3), count, 0.1)
+    return random_poses(np.random.default_rng(3), count, reach=0.1)
 
 
 def test_a_ball_of_1_m_around_the_centre_of_a_sphere_of_10_cm_costs_1_21():

@@ -27,7 +27,12 @@ SAME = 1e-9
 
 FEW = KnownPoints(free=POINTS.free[::110], known=POINTS.known)
 PROBLEM = RegistrationProblem(
-    GRID, FEW, around_truth(8, 0.1, 0.01), WORKSPACE, SIDE, StreamKey(3, 1)
+    sdf=GRID,
+    points=FEW,
+    initial_set=around_truth(8, 0.1, shift=0.01),
+    workspace=WORKSPACE,
+    free_resolution=SIDE,
+    key=StreamKey(3, 1),
 )
 
 

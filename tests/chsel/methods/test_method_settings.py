@@ -98,7 +98,7 @@ def test_an_installed_class_may_give_the_settings_of_each_preset():
             return IcpSettings(iterations=PRESETS.index(name) + 7)
 
     theirs = {"theirs": (Theirs, IcpSettings())}
-    choices = NamedChoices("method", "chsel.methods", "", theirs, lambda _: None)
+    choices = NamedChoices("method", "chsel.methods", page="", ours=theirs, lacks=lambda _: None)
     assert [choices.settings("theirs", name).iterations for name in PRESETS] == [7, 8, 9]
     changed = choices.build("theirs", {"redraw": "registration"}).settings
     assert changed == IcpSettings(iterations=7, redraw="registration")

@@ -34,7 +34,7 @@ WITH_STARTS_NEARBY = ("icp", "svgd", "cvo", "cvo_no_free_space")
 """Methods that find a pose from starts nearby alone."""
 
 
-def judged(method, problem, poses):
+def judged(method, problem, *, poses):
     """Costs of poses by code of its own, for methods whose cost has some."""
     cost = getattr(method.settings, "cost", None)
     if isinstance(cost, CostSettings):
@@ -52,8 +52,8 @@ def assert_whole(found, count):
     assert (np.diff(found.cost) >= 0.0).all()
 
 
-def assert_found(found, truth, within=0.005):
-    position, rotation = pose_errors(found.object_from_world[:1], truth, ObjectSymmetry())
+def assert_found(found, truth, *, within=0.005):
+    position, rotation = pose_errors(found.object_from_world[:1], truth, symmetry=ObjectSymmetry())
     assert position[0] < within
     assert rotation[0] < 0.05
 
@@ -71,7 +71,7 @@ def test_results_are_whole_and_neither_observers_nor_threads_change_a_bit(name, 
     problem = posed(method, FEW)
     found = method.register(problem)
     assert_whole(found, 30)
-    cost = judged(method, problem, found.object_from_world)
+    cost = judged(method, problem, poses=found.object_from_world)
     if cost is not None:
         np.testing.assert_allclose(found.cost, cost, rtol=1e-9, atol=1e-12)
     assert found.duplicate.sum() == 30 - len(np.unique(found.object_from_world, axis=0))
@@ -131,7 +131,8 @@ def test_on_a_plane_every_hypothesis_stands_on_it(name, measure):
 
 @pytest.mark.parametrize("name", WITH_ARCHIVE)
 def test_snapshots_of_the_archive_come_at_start_interval_and_end_and_only_improve(name):
-    watcher, method = Watcher(snapshot_interval=2), quick(name)
+    watcher = Watcher(snapshot_interval=2)
+    method = quick(name)
     found = method.register(posed(method, FEW), watcher)
     assert [archive.iteration for archive in watcher.archives] == [0, 2, 4, 6]
     coverage = [archive.coverage for archive in watcher.archives]
@@ -146,14 +147,16 @@ def test_snapshots_of_the_archive_come_at_start_interval_and_end_and_only_improv
 
 @pytest.mark.parametrize("name", WITH_ARCHIVE)
 def test_poses_of_the_low_cost_set_enter_the_archive(name):
-    method, truth = quick(name), inverse(TRUTH)[None]
-    without, problem = posed(method, FEW), posed(method, FEW, low_cost_set=truth)
-    cost = judged(method, problem, truth)
+    method = quick(name)
+    truth = inverse(TRUTH)[None]
+    without = posed(method, FEW)
+    problem = posed(method, FEW, low_cost_set=truth)
+    cost = judged(method, problem, poses=truth)
     assert cost is not None
     assert method.register(without).cost[0] > 2.0 * cost[0]
     assert method.register(problem).cost[0] <= cost[0] * (1.0 + 1e-9)
     first = method.register(without)
-    assert len(posed(method, FEW, first).low_cost_set) == len(first.elites)
+    assert len(posed(method, FEW, previous=first).low_cost_set) == len(first.elites)
 
 
 def test_more_passes_do_not_worsen_the_best_cost():

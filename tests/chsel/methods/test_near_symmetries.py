@@ -28,5 +28,7 @@ def test_near_symmetries_of_a_box(sides, halves, quarters):
 
 def test_an_object_without_symmetry_has_none():
     assert near_symmetries(GRID).shape == (0, 4, 4)
-    nowhere = SdfGrid(GRID.origin, 0.01, np.abs(GRID.values) + 0.01, GRID.gradients)
+    nowhere = SdfGrid(
+        GRID.origin, 0.01, values=np.abs(GRID.values) + 0.01, gradients=GRID.gradients
+    )
     assert near_symmetries(nowhere).shape == (0, 4, 4)

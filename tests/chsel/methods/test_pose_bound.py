@@ -77,11 +77,18 @@ def test_trust_has_the_bound_of_the_poses_that_explain_the_points_and_of_rivals(
     surface = trimesh.sample.sample_surface(BOX, 8, seed=1)[0] @ PLACE[:3, :3].T + PLACE[:3, 3]
     room = chsel.Workspace((-1, -1, -1), (1, 1, 1))
     points = chsel.KnownPoints(known=surface)
-    posed = RegistrationProblem(sdf, points, np.eye(4)[None], room, 0.01, StreamKey(0, 0))
+    posed = RegistrationProblem(
+        sdf=sdf,
+        points=points,
+        initial_set=np.eye(4)[None],
+        workspace=room,
+        free_resolution=0.01,
+        key=StreamKey(0, 0),
+    )
     far = PLACE @ turned(shift=(0.05, 0.0, 0.0))
     near = PLACE @ turned(shift=(0.0005, 0.0, 0.0))
     found = hypotheses_at(inverse(np.array([PLACE, near, far])))
-    trust = trust_by(build_method("icp"), posed, found)
+    trust = trust_by(build_method("icp"), posed, hypotheses=found)
     assert trust.centre_within < 0.045  # not of the pose 50 mm away, which explains nothing
     assert trust.centre_within >= 0.0005 - 1e-9
     assert trust.numbers["centre_within"] == trust.centre_within

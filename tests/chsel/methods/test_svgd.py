@@ -35,7 +35,7 @@ def _direct(particles, scale, median):
     direct(particles, scale, median)
 
 
-def directions(vectors, scores, scale=0.01, *, median=False):
+def directions(vectors, scores, *, scale=0.01, median=False):
     """phi (B, d) of particles (B, d) with gradients of log p (B, d)."""
     particles: Particles = particles_at(vectors)
     particles.scores[:] = scores
@@ -43,7 +43,7 @@ def directions(vectors, scores, scale=0.01, *, median=False):
     return particles.directions
 
 
-def directions_by_torch(vectors, scores, scale, *, median=False):
+def directions_by_torch(vectors, scores, *, scale, median=False):
     """The same by a matrix product and the gradient of the summed kernel by its first argument."""
     vectors = vectors.detach().requires_grad_()
     squares = ((vectors[:, None] - vectors.detach()[None]) ** 2).sum(dim=2)
@@ -61,7 +61,12 @@ def directions_by_torch(vectors, scores, scale, *, median=False):
 def posed(initial_set=None):
     initial_set = around_truth() if initial_set is None else initial_set
     return RegistrationProblem(
-        GRID, known_points(TRUTH, 15), initial_set, WORKSPACE, SIDE, StreamKey(5, 2)
+        sdf=GRID,
+        points=known_points(TRUTH, 15),
+        initial_set=initial_set,
+        workspace=WORKSPACE,
+        free_resolution=SIDE,
+        key=StreamKey(5, 2),
     )
 
 
@@ -73,20 +78,21 @@ def test_directions_are_those_of_torch(count, median):
         vectors = np.round(random.standard_normal((count, 3)), 1)  # with ties of the median
         scores = 10.0 * random.standard_normal((count, 3))
         expected = directions_by_torch(
-            torch.from_numpy(vectors), torch.from_numpy(scores), 2.0, median=median
+            torch.from_numpy(vectors), torch.from_numpy(scores), scale=2.0, median=median
         )
-        ours = directions(vectors, scores, 2.0, median=median)
+        ours = directions(vectors, scores, scale=2.0, median=median)
         np.testing.assert_allclose(ours, expected, rtol=1e-12, atol=1e-12)
     assert np.abs(ours - scores / count).max() > 0.1  # particles do act on each other
 
 
 @pytest.mark.parametrize("kernel", ["reference", "median"])
 def test_particles_move_as_torch_would_move_them(kernel):
-    problem = posed(initial_set=around_truth(6, 0.02, 0.002))
+    problem = posed(initial_set=around_truth(6, 0.02, shift=0.002))
     settings = SvgdSettings(kernel=kernel, scale=0.05, iterations=60)
     kept = Watcher()
     Svgd(settings).register(problem, kept)
-    cost, space = RelaxedCost.of(problem, settings.cost), SE3Space()
+    cost = RelaxedCost.of(problem, settings.cost)
+    space = SE3Space()
     vectors = torch.from_numpy(Poses.of(problem.initial_set).vectors.copy()).requires_grad_()
     adam = torch.optim.Adam([vectors], **ADAM)
     for iteration in range(60):
@@ -94,7 +100,7 @@ def test_particles_move_as_torch_would_move_them(kernel):
             np.testing.assert_allclose(kept.traces[1].vectors, vectors.detach(), atol=1e-8)
         (gradient,) = torch.autograd.grad(cost(*decode(space, vectors)).sum(), vectors)
         phi = directions_by_torch(
-            vectors, -settings.sharpness * gradient, settings.scale, median=kernel == "median"
+            vectors, -settings.sharpness * gradient, scale=settings.scale, median=kernel == "median"
         )
         vectors.grad = -phi
         adam.step()
@@ -103,7 +109,7 @@ def test_particles_move_as_torch_would_move_them(kernel):
 
 def test_the_object_is_found_where_it_was_touched_all_over():
     found = Svgd().register(posed())
-    position, rotation = pose_errors(found.object_from_world, TRUTH, ObjectSymmetry())
+    position, rotation = pose_errors(found.object_from_world, TRUTH, symmetry=ObjectSymmetry())
     assert position[0] < 0.005
     assert rotation[0] < 0.05
 

@@ -64,4 +64,4 @@ def ball_problem(poses, actions, *, weights=None, available=None, points=None, s
 @cache
 def ball():
     """The grid of the ball, 5 mm fine."""
-    return ball_grid(RADIUS, 0.005, 14)
+    return ball_grid(RADIUS, 0.005, half=14)

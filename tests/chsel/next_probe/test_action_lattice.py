@@ -17,7 +17,8 @@ from chsel.next_probe.decision_problem import HandShape
 from chsel.problem.points import Workspace
 
 # A box of 4 x 10 x 12 cm, its origin 2 cm from its back.
-LOWER, UPPER = np.array([-0.02, -0.05, -0.02]), np.array([0.02, 0.05, 0.10])
+LOWER = np.array([-0.02, -0.05, -0.02])
+UPPER = np.array([0.02, 0.05, 0.10])
 CORNERS = np.array([[(LOWER, UPPER)[i][k] for k, i in enumerate(at)] for at in np.ndindex(2, 2, 2)])
 FACES = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]]
 HAND = HandShape(CORNERS, FACES)
@@ -44,7 +45,7 @@ def test_actions_around_start_outside_cross_the_workspace_and_stay_above_the_flo
     workspace, spacing, most
 ):
     try:
-        actions = around_actions(ActionSettings(spacing=spacing, most=most), workspace, HAND)
+        actions = around_actions(ActionSettings(spacing=spacing, most=most), workspace, hand=HAND)
     except SettingError:  # too low for the hand
         assert workspace.upper[2] < 0.12
         return
@@ -65,7 +66,7 @@ def test_actions_around_start_outside_cross_the_workspace_and_stay_above_the_flo
 
 
 def test_each_direction_covers_the_workspace_with_no_gap_wider_than_a_spacing():
-    actions = around_actions(ActionSettings(spacing=0.1), WORKSPACE, HAND)
+    actions = around_actions(ActionSettings(spacing=0.1), WORKSPACE, hand=HAND)
     directions = actions.world_from_hand[:, :3, 2]
     views = np.unique(directions.round(6), axis=0)
     assert len(views) == 5
@@ -83,7 +84,7 @@ def test_each_direction_covers_the_workspace_with_no_gap_wider_than_a_spacing():
 
 
 def test_lattices_of_opposite_sides_are_half_a_spacing_apart():
-    actions = around_actions(ActionSettings(spacing=0.1), WORKSPACE, HAND)
+    actions = around_actions(ActionSettings(spacing=0.1), WORKSPACE, hand=HAND)
     starts, directions = actions.world_from_hand[:, :3, 3], actions.world_from_hand[:, :3, 2]
     for along, across in ((0, 1), (1, 0)):
         first, second = (starts[directions[:, along] == sign, across][0] for sign in (-1.0, 1.0))
@@ -92,7 +93,9 @@ def test_lattices_of_opposite_sides_are_half_a_spacing_apart():
 
 def test_a_forward_lattice_keeps_its_start_and_length():
     settings = ActionSettings(speed=0.1, setup=2.0)
-    actions = forward_actions(settings, WORKSPACE, HAND, FORWARD, start=-0.05, length=0.3)
+    actions = forward_actions(
+        settings, WORKSPACE, hand=HAND, rotation=FORWARD, start=-0.05, length=0.3
+    )
     assert len(actions) == 12 * 12
     np.testing.assert_array_equal(actions.world_from_hand[:, 0, 3], -0.05)
     np.testing.assert_array_equal(actions.length, 0.3)
@@ -103,8 +106,8 @@ def test_a_forward_lattice_keeps_its_start_and_length():
 @pytest.mark.parametrize("radius", [0.3, 0.6, 0.9])
 def test_the_hand_stays_within_its_reach(radius):
     reach = ReachBall((-0.2, 0.1, 0.2), radius)
-    every = around_actions(ActionSettings(), WORKSPACE, HAND)
-    actions = around_actions(ActionSettings(reach=reach), WORKSPACE, HAND)
+    every = around_actions(ActionSettings(), WORKSPACE, hand=HAND)
+    actions = around_actions(ActionSettings(reach=reach), WORKSPACE, hand=HAND)
     assert 0 < len(actions) < len(every)
     start, z = actions.world_from_hand[:, :3, 3], actions.world_from_hand[:, :3, 2]
     for share in (0.0, 1.0):
@@ -115,12 +118,12 @@ def test_the_hand_stays_within_its_reach(radius):
 def test_a_reach_or_workspace_without_any_action_is_an_error():
     nowhere = ActionSettings(reach=ReachBall((9.0, 0.0, 0.0), 1.0))
     with pytest.raises(SettingError, match="leaves no action; accepted: a workspace above"):
-        around_actions(nowhere, WORKSPACE, HAND)
+        around_actions(nowhere, WORKSPACE, hand=HAND)
     cellar = Workspace((-1.0, -1.0, -2.0), (1.0, 1.0, -1.0))
     with pytest.raises(SettingError, match="leaves no action"):
-        around_actions(ActionSettings(), cellar, HAND)
+        around_actions(ActionSettings(), cellar, hand=HAND)
 
 
 def test_a_tiny_spacing_costs_no_more_than_what_is_offered():
-    actions = around_actions(ActionSettings(spacing=1e-9, most=2_000), WORKSPACE, HAND)
+    actions = around_actions(ActionSettings(spacing=1e-9, most=2_000), WORKSPACE, hand=HAND)
     assert 1_800 < len(actions) <= 2_000

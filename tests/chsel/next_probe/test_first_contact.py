@@ -43,8 +43,8 @@ def test_first_contacts_are_those_of_the_meshes(name):
     sdf = SdfGrid.from_mesh(mesh, 0.01)
     belief = WeightedPoses(inverse(world_from_object[None]), np.ones(1))
     hand = panda_hand()
-    forecast = first_contacts(sdf, belief, actions, hand.shape)
-    engine = KinematicEngine(mesh, world_from_object, ProbingSettings(), hand)
+    forecast = first_contacts(sdf, belief, actions=actions, hand=hand.shape)
+    engine = KinematicEngine(mesh, world_from_object, settings=ProbingSettings(), hand=hand)
     exact = [exactly(engine, start) for start in actions.world_from_hand]
     ways, places = np.array([way for way, _ in exact]), np.array([place for _, place in exact])
     met = np.isfinite(ways) & np.isfinite(forecast.travel[0])
@@ -60,11 +60,12 @@ def test_first_contacts_are_those_of_the_meshes(name):
 
 @pytest.mark.parametrize("ahead", [(1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.6, -0.48, 0.64)])
 def test_a_flat_hand_meets_a_ball_at_its_nearest_point(ahead):
-    centre, ahead = np.array([0.2, -0.1, 0.3]), np.array(ahead)
+    centre = np.array([0.2, -0.1, 0.3])
+    ahead = np.array(ahead)
     starts = [centre - distance * ahead for distance in (0.3, 0.07, 0.02, 0.6, -0.3)]
     actions = Actions(np.array([facing(start, ahead) for start in starts]), np.full(5, 0.5))
     found = first_contacts(
-        ball(), WeightedPoses(at(tuple(centre)), np.ones(1)), actions, box_hand()
+        ball(), WeightedPoses(at(tuple(centre)), np.ones(1)), actions=actions, hand=box_hand()
     )
     ways = np.array([0.3, 0.07, 0.02, np.inf, -0.3]) - RADIUS  # the fourth ends too early
     assert found.travel[0] == pytest.approx(ways, abs=1e-3)
@@ -74,9 +75,10 @@ def test_a_flat_hand_meets_a_ball_at_its_nearest_point(ahead):
     assert not found.contact[0, ~met].any()
 
 
-def by_definition(sdf, pose, world_from_hand, hand):
+def by_definition(sdf, pose, *, world_from_hand, hand):
     """The least way over the fine points around the three of the seen points that are met first."""
-    surface, front = touched_points(sdf), hand.front
+    surface = touched_points(sdf)
+    front = hand.front
     hand_from_object = inverse(world_from_hand) @ inverse(pose)
 
     def ways(points):
@@ -108,7 +110,8 @@ def bent_hand():
 
 
 def test_the_front_of_a_hand_is_its_highest_face_over_the_middle_of_a_cell():
-    hand, (heights, lower, cell) = bent_hand(), bent_hand().front
+    hand = bent_hand()
+    (heights, lower, cell) = bent_hand().front
     np.testing.assert_allclose(lower, hand.vertices[:, :2].min(axis=0) - CELL)
     upper = lower + cell * np.array(heights.shape)
     beyond = (upper - hand.vertices[:, :2].max(axis=0)) / CELL
@@ -129,7 +132,8 @@ def test_the_front_of_a_hand_is_its_highest_face_over_the_middle_of_a_cell():
 
 @pytest.mark.parametrize("hand", [box_hand(), bent_hand()])
 def test_first_contacts_are_those_of_the_definition(hand):
-    stream, sdf = np.random.default_rng(8), SdfGrid.from_mesh(load_model("clamp"), 0.005)
+    stream = np.random.default_rng(8)
+    sdf = SdfGrid.from_mesh(load_model("clamp"), 0.005)
     centre = sdf.bounds.mean(axis=0)
     pose = inverse(compose(random_rotations(stream, 1)[0], np.array([0.1, -0.2, 0.3])))
     middle = apply(inverse(pose), centre[None])[0]
@@ -137,10 +141,10 @@ def test_first_contacts_are_those_of_the_definition(hand):
     beside = stream.uniform(-0.03, 0.03, (200, 2))
     starts = middle + np.einsum("aij,aj->ai", turns[:, :, :2], beside) - 0.4 * turns[:, :, 2]
     actions = Actions(compose(turns, starts), np.full(200, _WAY))
-    found = first_contacts(sdf, WeightedPoses(pose[None], np.ones(1)), actions, hand)
+    found = first_contacts(sdf, WeightedPoses(pose[None], np.ones(1)), actions=actions, hand=hand)
     assert np.isfinite(found.travel).sum() >= 100
     for n, world_from_hand in enumerate(actions.world_from_hand):
-        way, place = by_definition(sdf, pose, world_from_hand, hand)
+        way, place = by_definition(sdf, pose, world_from_hand=world_from_hand, hand=hand)
         assert found.travel[0, n] == pytest.approx(way, abs=1e-12)
         np.testing.assert_allclose(found.contact[0, n], place, rtol=0, atol=1e-12)
 
@@ -150,12 +154,14 @@ def test_threads_and_other_actions_change_no_bit(threads):
     poses = at(*stream.uniform(-0.1, 0.1, (60, 3)).tolist())
     belief = WeightedPoses(poses, np.full(60, 1.0 / 60.0))
     actions = along_x(stream.uniform(-0.1, 0.1, (9, 2)).tolist())
-    found = first_contacts(ball(), belief, actions, box_hand())
+    found = first_contacts(ball(), belief, actions=actions, hand=box_hand())
     some = Actions(actions.world_from_hand[[7, 2]], actions.length[[7, 2]])
-    few = first_contacts(ball(), WeightedPoses(poses[5:7], np.full(2, 0.5)), some, box_hand())
+    few = first_contacts(
+        ball(), WeightedPoses(poses[5:7], np.full(2, 0.5)), actions=some, hand=box_hand()
+    )
     assert np.array_equal(few.travel, found.travel[5:7][:, [7, 2]])
     assert np.array_equal(few.contact, found.contact[5:7][:, [7, 2]])
     torch.set_num_threads(1)
-    alone = first_contacts(ball(), belief, actions, box_hand())
+    alone = first_contacts(ball(), belief, actions=actions, hand=box_hand())
     assert np.array_equal(alone.travel, found.travel)
     assert np.array_equal(alone.contact, found.contact)

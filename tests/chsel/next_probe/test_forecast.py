@@ -26,7 +26,7 @@ NOISE = 0.005
 PLACES = [(0.0, 0.0), (0.06, 0.0), (-0.05, 0.03), (0.0, -0.1), (0.28, 0.28)]
 
 
-def some_problem(seed, count, reach):
+def some_problem(seed, count, *, reach):
     """Poses around the middle of the workspace, some of weight 0."""
     stream = np.random.default_rng(seed)
     poses = at(*stream.uniform(-reach, reach, (count, 3)).tolist())
@@ -38,13 +38,19 @@ def test_before_any_contact_the_object_stands_on_the_floor_outside_of_free_space
     grid = np.stack(np.meshgrid(*[np.arange(-0.3, 0.31, 0.02)] * 3), axis=-1).reshape(-1, 3)
     left = KnownPoints(free=grid[grid[:, 0] < 0.1])
     settings = BeliefSettings(poses=40, floor=-0.1)
-    belief = belief_before(ball(), left, WORKSPACE, StreamKey(3, 0), settings)
+    belief = belief_before(
+        ball(), left, workspace=WORKSPACE, key=StreamKey(3, 0), settings=settings
+    )
     centres = Poses.of(belief.object_from_world).origins
     np.testing.assert_allclose(centres[:, 2], RADIUS - 0.1, atol=0.004)
     apart = np.sqrt(((centres[:, None] - left.free) ** 2).sum(axis=-1))
     assert apart.min() > RADIUS - ball().resolution - 1e-4  # of all free points
     anywhere = belief_before(
-        ball(), left, WORKSPACE, StreamKey(3, 0), replace(settings, floor=None)
+        ball(),
+        left,
+        workspace=WORKSPACE,
+        key=StreamKey(3, 0),
+        settings=replace(settings, floor=None),
     )
     assert np.ptp(Poses.of(anywhere.object_from_world).origins[:, 2]) > 0.3
     assert belief.weights.sum() == pytest.approx(1.0)
@@ -53,7 +59,11 @@ def test_before_any_contact_the_object_stands_on_the_floor_outside_of_free_space
 def test_after_a_registration_candidates_count_and_else_hypotheses():
     poses = at(*((0.01 * n, 0.0, 0.0) for n in range(30)))
     found = Hypotheses(
-        poses[:3], np.zeros(3), np.array([False, True, False]), np.zeros(3, np.int64), poses
+        poses[:3],
+        np.zeros(3),
+        duplicate=np.array([False, True, False]),
+        cell=np.zeros(3, np.int64),
+        elites=poses,
     )
     np.testing.assert_array_equal(
         belief_after(found, BeliefSettings()).object_from_world, poses[:3:2]
@@ -67,7 +77,8 @@ def test_after_a_registration_candidates_count_and_else_hypotheses():
 def test_surprise_is_minus_the_logarithm_of_the_chance_of_what_happened():
     """Two of three balls are met, at places apart in all axes."""
     poses = at((0.0, 0.01, 0.0), (0.1, -0.01, 0.005), (0.0, 0.2, 0.2))
-    weights, nowhere = np.array([0.5, 0.3, 0.2]), np.full(3, 5.0)
+    weights = np.array([0.5, 0.3, 0.2])
+    nowhere = np.full(3, 5.0)
     problem = ball_problem(poses, along_x([(0.0, 0.0)]), weights=weights)
     decision = build_policy("grid", {"stop": {"spread": 0.0, "gain": 0.0}}).decide(problem)
     places, share = decision.contacts[:2], weights[:2] / 0.8
@@ -78,9 +89,11 @@ def test_surprise_is_minus_the_logarithm_of_the_chance_of_what_happened():
             squares = ((places - contact) ** 2).sum(axis=1)
             near = np.maximum(np.exp(-squares / (4.0 * noise**2 + scatter)), 0.001)
             expected = -np.log(0.95 * weights @ [*near, 0.001] + 0.05 * 0.01)
-            assert surprise(problem, decision, noise, contact) == pytest.approx(expected)
+            assert surprise(problem, decision, noise=noise, contact=contact) == pytest.approx(
+                expected
+            )
         missed = -np.log(0.95 * weights @ [0.001, 0.001, 1.0] + 0.05 * 0.01)
-        assert surprise(problem, decision, noise, None) == pytest.approx(missed)
+        assert surprise(problem, decision, noise=noise, contact=None) == pytest.approx(missed)
 
 
 def test_the_spread_is_the_root_mean_square_distance_of_surfaces():
@@ -99,12 +112,16 @@ def test_the_spread_is_the_root_mean_square_distance_of_surfaces():
 
 @pytest.mark.parametrize(("seed", "count", "reach"), [(3, 10, 0.06), (0, 1, 0.0), (5, 25, 0.15)])
 def test_gains_are_those_of_the_formulas(seed, count, reach):
-    problem = some_problem(seed, count, reach)
-    forecast, weights = Forecast(problem, NOISE), problem.belief.weights
-    first, distances, gains = forecast.first, forecast.distances, forecast.gains
+    problem = some_problem(seed, count, reach=reach)
+    forecast = Forecast(problem, NOISE)
+    weights = problem.belief.weights
+    first = forecast.first
+    distances = forecast.distances
+    gains = forecast.gains
     hit = np.isfinite(first.travel)
     squared = ((first.contact[:, None] - first.contact[None]) ** 2).sum(axis=-1)  # (K, K, A)
-    both, neither = hit[:, None] & hit[None], ~hit[:, None] & ~hit[None]
+    both = hit[:, None] & hit[None]
+    neither = ~hit[:, None] & ~hit[None]
     alike = np.where(both, np.exp(-squared / (8.0 * NOISE**2)), np.where(neither, 1.0, 0.01))
     with np.errstate(divide="ignore"):
         inner = np.log(np.einsum("j,ija->ia", weights, alike))
@@ -129,7 +146,7 @@ def test_a_start_behind_the_object_is_blocked():
 
 @pytest.mark.parametrize("name", POLICIES)
 def test_one_pose_or_one_action_is_decided(name):
-    problem = some_problem(1, 20, 0.1)
+    problem = some_problem(1, 20, reach=0.1)
     sure = replace(problem, belief=WeightedPoses(at((0.0, 0.0, 0.0)), np.ones(1)))
     assert build_policy(name).decide(sure).stop == "spread"
     single = ball_problem(problem.belief.object_from_world, along_x([(0.0, 0.0)]))

@@ -25,7 +25,8 @@ def findings(source, *, everywhere=True):
     nodes = list(ast.walk(tree))
     kernels = [node for node in nodes if isinstance(node, ast.FunctionDef) and _is_kernel(node)]
     compiled = {node for kernel in kernels for node in ast.walk(kernel)}
-    modules, integers = {}, set()
+    modules = {}
+    integers = set()
     for node in nodes:
         if isinstance(node, ast.Import):
             modules |= {alias.asname or alias.name: alias.name for alias in node.names}

@@ -39,4 +39,4 @@ def test_pointers_of_git_lfs_are_named_by_every_reader(tmp_path, file_name, read
 def test_other_files_and_folders_pass(tmp_path):
     (tmp_path / "notes.txt").write_text("version 1")
     for path in (tmp_path, tmp_path / "notes.txt", tmp_path / "missing"):
-        refuse_special_file("it", Path(path), SessionError)
+        refuse_special_file("it", Path(path), error=SessionError)

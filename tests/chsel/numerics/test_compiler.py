@@ -44,7 +44,8 @@ print(near(1.0), sum(near.stats.cache_misses.values()))
 
 def start(code, *words, root=ROOT, **changes):
     environment = {**os.environ, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1", **changes}
-    command, pipe = [sys.executable, "-c", code, *words], subprocess.PIPE
+    command = [sys.executable, "-c", code, *words]
+    pipe = subprocess.PIPE
     return subprocess.Popen(command, cwd=root, env=environment, stdout=pipe, stderr=pipe, text=True)
 
 

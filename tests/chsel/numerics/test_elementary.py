@@ -36,7 +36,7 @@ def error(found, exact):
     return float(abs((mpmath.mpf(float(found)) - exact) / math.ulp(float(exact))))
 
 
-def scattered(low, high, seed):
+def scattered(low, high, *, seed):
     """Numbers of both signs, their sizes spread evenly over the powers of two in between."""
     stream = np.random.Generator(np.random.Philox(seed))
     powers = np.floor(stream.uniform(low, high, COUNT)).astype(int)
@@ -44,13 +44,13 @@ def scattered(low, high, seed):
     return sizes * np.where(stream.random(COUNT) < 0.5, -1.0, 1.0)
 
 
-def even(low, high, seed):
+def even(low, high, *, seed):
     return np.random.Generator(np.random.Philox(seed)).uniform(low, high, COUNT)
 
 
 def near_quarter_turns():
     """The doubles around multiples of pi/2, where the reduced argument is all cancellation."""
-    turns = np.unique(np.floor(np.abs(scattered(0, 19, 1))))
+    turns = np.unique(np.floor(np.abs(scattered(0, 19, seed=1))))
     with mpmath.workprec(250):
         nearest = np.array([float(n * mpmath.pi / 2) for n in turns.astype(int).tolist()])
     return np.concatenate([nearest, np.nextafter(nearest, 0), -np.nextafter(nearest, np.inf)])
@@ -64,20 +64,29 @@ def cosine(x):
     return sine_cosine(x)[1]
 
 
-ANGLES = [scattered(-80, 2, 1), even(-7, 7, 2), even(-(2.0**20), 2.0**20, 4), near_quarter_turns()]
-POSITIVE = [np.abs(scattered(-1022, 1023, 1)), 1.0 + scattered(-52, -2, 2), even(0.3, 3.0, 3)]
-POSITIVE += [np.abs(scattered(-1074, -1023, 4))]  # subnormals
-SEAMS = 1.0 + scattered(-52, -8, 11)  # of the table of arctangents
-COORDINATES = [
-    (scattered(-3, 3, 1), scattered(-3, 3, 2)),
-    (scattered(-1022, 1023, 3), scattered(-1022, 1023, 4)),
-    (scattered(-1e3, -990, 5), scattered(-1e3, -990, 6)),
-    (scattered(1010, 1023, 7), scattered(1010, 1023, 8)),
-    (scattered(-36, -20, 9), scattered(0, 1, 10)),
-    (np.tile([0.25, 0.5, 0.75, 1.0], COUNT // 4), SEAMS),
-    (np.abs(scattered(-1074, -1023, 12)), np.abs(scattered(0, 3, 13))),
+ANGLES = [
+    scattered(-80, 2, seed=1),
+    even(-7, 7, seed=2),
+    even(-(2.0**20), 2.0**20, seed=4),
+    near_quarter_turns(),
 ]
-EXPONENTS = [even(-745, 709.7, 1), scattered(-60, 3, 2), even(-745.13, -708, 3)]
+POSITIVE = [
+    np.abs(scattered(-1022, 1023, seed=1)),
+    1.0 + scattered(-52, -2, seed=2),
+    even(0.3, 3.0, seed=3),
+]
+POSITIVE += [np.abs(scattered(-1074, -1023, seed=4))]  # subnormals
+SEAMS = 1.0 + scattered(-52, -8, seed=11)  # of the table of arctangents
+COORDINATES = [
+    (scattered(-3, 3, seed=1), scattered(-3, 3, seed=2)),
+    (scattered(-1022, 1023, seed=3), scattered(-1022, 1023, seed=4)),
+    (scattered(-1e3, -990, seed=5), scattered(-1e3, -990, seed=6)),
+    (scattered(1010, 1023, seed=7), scattered(1010, 1023, seed=8)),
+    (scattered(-36, -20, seed=9), scattered(0, 1, seed=10)),
+    (np.tile([0.25, 0.5, 0.75, 1.0], COUNT // 4), SEAMS),
+    (np.abs(scattered(-1074, -1023, seed=12)), np.abs(scattered(0, 3, seed=13))),
+]
+EXPONENTS = [even(-745, 709.7, seed=1), scattered(-60, 3, seed=2), even(-745.13, -708, seed=3)]
 
 
 @pytest.mark.parametrize(
@@ -141,7 +150,8 @@ def test_zeros_and_infinities_of_the_arctangent_are_those_of_c():
     values += [-v for v in values]
     for y in values:
         for x in values:
-            found, expected = arctangent(y, x), math.atan2(y, x)
+            found = arctangent(y, x)
+            expected = math.atan2(y, x)
             assert found == pytest.approx(expected, rel=3e-16, abs=0.0), (y, x)
             assert math.copysign(1.0, found) == math.copysign(1.0, expected), (y, x)
 
@@ -157,7 +167,7 @@ def test_zeros_and_infinities_of_the_arctangent_are_those_of_c():
     ],
 )
 def test_arrays_keep_their_shape_and_hold_the_scalars(arrays, scalar):
-    values = np.abs(scattered(-3, 3, 1))[:24].reshape(2, 3, 4)
+    values = np.abs(scattered(-3, 3, seed=1))[:24].reshape(2, 3, 4)
     values.setflags(write=False)
     for x in (values.transpose(2, 0, 1), values[:, ::2, 1:], values[:0], values[0, 0, 0], 2):
         expected = [scalar(float(v)) for v in np.ravel(x).tolist()]
@@ -171,7 +181,8 @@ def decomposed(matrix, work, values, vectors):
 
 def eigen(matrix):
     n = len(matrix)
-    values, vectors = np.full(n, np.nan), np.full((n, n), np.nan)
+    values = np.full(n, np.nan)
+    vectors = np.full((n, n), np.nan)
     before = matrix.copy()
     decomposed(matrix, np.full((n, n), np.nan), values, vectors)
     np.testing.assert_array_equal(matrix, before)

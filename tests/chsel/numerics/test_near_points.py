@@ -45,7 +45,8 @@ def test_points_in_one_finest_cell_stay_in_their_order_and_others_do_not_depend_
     order = point_tree(twins, 0.02).order
     np.testing.assert_array_equal(order.reshape(-1, 3) % 3, np.tile([0, 1, 2], (len(centres), 1)))
     shuffle = stream.permutation(len(centres))
-    first, second = point_tree(centres, 0.02), point_tree(centres[shuffle], 0.02)
+    first = point_tree(centres, 0.02)
+    second = point_tree(centres[shuffle], 0.02)
     np.testing.assert_array_equal(centres[first.order], centres[shuffle][second.order])
 
 
@@ -57,7 +58,7 @@ def fill_hits(tree, cells, move, slack, near):
     return rounding, near.number[0], select(tree, cells, to_cell, rounding, near, 0)
 
 
-def found_in(tree, cells, slack):
+def found_in(tree, cells, *, slack):
     """Numbers in the tree's order: the points of packets within a slack, and those in the set."""
     near = near_points_for(tree, 1)
     rounding, packets, count = fill_hits(tree, cells, STAY, slack, near)
@@ -75,11 +76,11 @@ def cell_sets(draw):
     cells = np.zeros(shape, dtype=bool)
     inner = cells[1:-2, 1:-2, 1:-2]
     inner[...] = stream.random(inner.shape) < draw(st.sampled_from([0.0, 0.01, 0.1, 0.7, 1.1]))
-    box = box_of(np.full(3, -0.1), 0.02, shape, between=draw(st.booleans()))
+    box = box_of(np.full(3, -0.1), 0.02, shape=shape, between=draw(st.booleans()))
     return cell_set_of(box, cells), cells
 
 
-def gap(cells, index, places):
+def gap(cells, index, *, places):
     """Least distance of each point (P, 3) to any of the cells (C, 3)."""
     lower = np.array(cells.box.first) + (index - 0.5 + 0.5 * cells.box.between) * 0.02
     apart = np.maximum(lower[None] - places[:, None], places[:, None] - lower[None] - 0.02)
@@ -91,11 +92,11 @@ def gap(cells, index, places):
 def test_all_points_in_the_set_and_within_the_slack_are_found_and_few_others(drawn, points, slack):
     cells, flags = drawn
     tree = point_tree(points, 0.02)
-    gathered, selected = found_in(tree, cells, slack)
+    gathered, selected = found_in(tree, cells, slack=slack)
     if not flags.any() or len(points) == 0:
         assert len(selected) == 0
         return
-    distances = gap(cells, np.argwhere(flags), points[tree.order])
+    distances = gap(cells, np.argwhere(flags), places=points[tree.order])
     assert np.isin(np.flatnonzero(distances <= slack), gathered).all()
     assert np.isin(np.flatnonzero(distances == 0.0), selected).all()
     assert (np.diff(selected) > 0).all()
@@ -108,8 +109,9 @@ def test_few_points_are_gathered_about_a_small_set():
     cells = np.zeros((11, 11, 11), dtype=bool)
     cells[5, 5, 5] = True
     points = 0.25 * scattered(np.random.default_rng(2), 20_000)
-    tree, box = point_tree(points, 0.0025), box_of(np.full(3, -0.1), 0.02, cells.shape)
-    gathered, selected = found_in(tree, cell_set_of(box, cells), 0.0)
+    tree = point_tree(points, 0.0025)
+    box = box_of(np.full(3, -0.1), 0.02, shape=cells.shape)
+    gathered, selected = found_in(tree, cell_set_of(box, cells), slack=0.0)
     inside = (np.abs(points[tree.order]) < 0.01).all(axis=1).sum()
     assert 0 < inside <= len(selected) < 1.1 * inside + 1
     assert len(gathered) < 2 * 27 * inside  # neighbouring cells are 0 away, too
@@ -121,7 +123,7 @@ def test_clearances_are_distances_to_the_nearest_voxel_outside(share, gap):
     stream = np.random.default_rng(int(1000.0 * share))
     inside = stream.random((7, 10, 13)) < share
     out = np.empty(inside.shape, dtype=np.int64)
-    squared_clearances(inside, out, gap)
+    squared_clearances(inside, out, gap=gap)
     outside = np.argwhere(~inside)
     if len(outside) == 0:
         assert (out >= 2**60).all()

@@ -45,7 +45,7 @@ def test_pieces_cover_the_range_once(threads, count, multiple, least):
         starts.append(first)
         done.extend(range(first, last))
 
-    parallel_for(run, count, no_scratch, least=least, multiple=multiple)
+    parallel_for(run, count, scratch=no_scratch, least=least, multiple=multiple)
     assert sorted(done) == list(range(count))
     assert all(first % multiple == 0 for first in starts)
 
@@ -82,7 +82,9 @@ def test_the_number_of_threads_is_what_was_set_or_that_of_torch_or_openmp():
 
 def test_every_thread_works_in_scratch_of_its_own(threads):
     """No thread goes on before all have begun."""
-    begun, used, kept = threading.Barrier(threads), {}, []
+    begun = threading.Barrier(threads)
+    used = {}
+    kept = []
 
     def run(first, last, own):
         if threading.get_ident() not in used:
@@ -90,7 +92,7 @@ def test_every_thread_works_in_scratch_of_its_own(threads):
             begun.wait()
         used[threading.get_ident()].add(id(own))
 
-    parallel_for(run, 200, lambda: kept.append(object()) or kept[-1])
+    parallel_for(run, 200, scratch=lambda: kept.append(object()) or kept[-1])
     assert [len(own) for own in used.values()] == [1] * threads
     assert len(set.union(*used.values())) == threads
 
@@ -101,7 +103,7 @@ def test_an_error_in_a_piece_reaches_the_caller(threads):
             raise ValueError("piece with 57")
 
     with pytest.raises(ValueError, match="piece with 57"):
-        parallel_for(run, 100, no_scratch)
+        parallel_for(run, 100, scratch=no_scratch)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="threads inherit their rounding on Linux")
@@ -113,7 +115,7 @@ def test_arithmetic_that_flushes_subnormals_is_refused():
         with pytest.raises(EngineError, match="flushes subnormal numbers to zero"):
             require_ieee_arithmetic()
         with pytest.raises(EngineError, match="flushes subnormal"), use_threads(2):
-            parallel_for(lambda first, last, _: None, 100, no_scratch)
+            parallel_for(lambda first, last, _: None, 100, scratch=no_scratch)
     finally:
         torch.set_flush_denormal(False)
 
@@ -121,7 +123,7 @@ def test_arithmetic_that_flushes_subnormals_is_refused():
 def register():
     points = {"surface": np.array([[0.025, 0.0, 0.0]]), "free": np.array([[0.1, 0.0, 0.0]])}
     settings = {"descent": {"restarts": 1, "iterations": 1}, "emitter": {"iterations": 1}}
-    chsel.register(ball_grid(0.025, 0.01, 4), **points, method="chsel", settings=settings)
+    chsel.register(ball_grid(0.025, 0.01, half=4), **points, method="chsel", settings=settings)
 
 
 @pytest.mark.skipif(not MODES or platform.system() != "Linux", reason="fesetround's values differ")

@@ -17,7 +17,7 @@ RESOLUTION = 0.02
 
 def ball(radius=0.1, resolution=RESOLUTION):
     """A ball around the origin."""
-    return ball_grid(radius, resolution, int(np.ceil((radius + 0.05) / resolution)))
+    return ball_grid(radius, resolution, half=int(np.ceil((radius + 0.05) / resolution)))
 
 
 def box(half, resolution=RESOLUTION):
@@ -31,7 +31,7 @@ def box(half, resolution=RESOLUTION):
     away = np.maximum(over, 0.0) * np.sign(nodes)
     inner = np.where(over == over.max(axis=0), np.sign(nodes), 0.0)
     gradient = np.where(outside > 0.0, away / np.maximum(outside, 1e-12), inner)
-    return SdfGrid(origin, resolution, values, np.moveaxis(gradient, 0, -1))
+    return SdfGrid(origin, resolution, values=values, gradients=np.moveaxis(gradient, 0, -1))
 
 
 def noise(stream):
@@ -50,7 +50,7 @@ def noise(stream):
         for end, sign in ((0, -1.0), (-1, 1.0)):
             if stream.uniform() < 0.9:
                 normals[end] = sign * np.abs(normals[end])
-    return SdfGrid(stream.uniform(-0.1, 0.0, 3), 0.03, values, gradients)
+    return SdfGrid(stream.uniform(-0.1, 0.0, 3), 0.03, values=values, gradients=gradients)
 
 
 OBJECTS: dict[str, Callable[[np.random.Generator], SdfGrid]] = {
@@ -64,7 +64,8 @@ def scene(stream, sdf, *, far=0.0):
     """A problem with points of every class, and a pose (4, 4) for the truth; `far` off 0."""
     rotation = random_rotations(stream, 1)
     truth = compose(rotation, far + stream.uniform(-0.1, 0.1, (1, 3)))[0]
-    middle, span = sdf.bounds.mean(axis=0), np.ptp(sdf.bounds, axis=0)
+    middle = sdf.bounds.mean(axis=0)
+    span = np.ptp(sdf.bounds, axis=0)
 
     def around(count, size):
         return apply(truth, middle + stream.uniform(-size, size, (count, 3)) * span)
@@ -76,8 +77,15 @@ def scene(stream, sdf, *, far=0.0):
     inside = sdf.at(apply(np.linalg.inv(truth), known))[0] if len(known) else []
     values = np.asarray(inside) * stream.integers(0, 2, len(known))
     occupied = around(int(stream.integers(0, 4)), 0.1)
-    points = KnownPoints(free, occupied, known, values)
+    points = KnownPoints(free, occupied, known=known, known_sdf=values)
     if points.count == 0:
         points = KnownPoints(known=truth[None, :3, 3])
     start = np.eye(4)[None]
-    return RegistrationProblem(sdf, points, start, WORKSPACE, 0.03, StreamKey(7, 2)), truth
+    return RegistrationProblem(
+        sdf=sdf,
+        points=points,
+        initial_set=start,
+        workspace=WORKSPACE,
+        free_resolution=0.03,
+        key=StreamKey(7, 2),
+    ), truth

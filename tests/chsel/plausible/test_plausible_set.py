@@ -35,12 +35,12 @@ from chsel.problem.streams import StreamKey
 from tests.chsel.plausible.scenes import OBJECTS, ball, box, scene
 
 SMALL = PoseGridSettings(
-    Offsets(((-0.06, 0.06, 5),), ((-0.1, 0.0, 2), (0.02, 0.05, 3)), ((0.0, 0.0, 1),)),
+    Offsets(((-0.06, 0.06, 5),), ((-0.1, 0.0, 2), (0.02, 0.05, 3)), z=((0.0, 0.0, 1),)),
     rotations=30,
     upright=4,
 )
 MANY = PoseGridSettings(
-    Offsets(((-0.06, 0.06, 7),), ((-0.1, 0.0, 3), (0.01, 0.05, 3)), ((-0.2, 0.3, 6),)),
+    Offsets(((-0.06, 0.06, 7),), ((-0.1, 0.0, 3), (0.01, 0.05, 3)), z=((-0.2, 0.3, 6),)),
     rotations=10,
     upright=4,
 )
@@ -58,10 +58,12 @@ def costs(draw):
     )
 
 
-def brute_force(problem, poses, by):
+def brute_force(problem, poses, *, by):
     """C (B,) of world_from_object poses (B, 4, 4), term by term as it is defined."""
     points, sdf = problem.points, problem.sdf
-    known, free, occupied = [], [], []
+    known = []
+    free = []
+    occupied = []
     for move in inverse(poses):
         s = [
             sdf.at(apply(move, part), lookup=by.lookup, outside=by.outside)[0]
@@ -100,16 +102,18 @@ def test_what_a_scan_finds_is_what_brute_force_finds_to_the_bit(
         problem = replace(problem, points=replace(problem.points, known=known))
         truth = compose(np.eye(3), np.rint(truth[:3, 3] / 0.01) * 0.01)
     cost = EvaluationCost(problem, by)
-    grid = grid_around(truth, MANY, seed)
+    grid = grid_around(truth, MANY, seed=seed)
     poses = grid.poses(np.arange(len(grid)))
     every = cost.evaluate(inverse(poses))
     if far == 0.0 or by.lookup == "trilinear":
         # But at a border of cells or a jump of the cost, where rounding decides.
         some = slice(None, None, 97)
-        close = np.isclose(every[some], brute_force(problem, poses[some], by), rtol=1e-9, atol=1e-9)
+        close = np.isclose(
+            every[some], brute_force(problem, poses[some], by=by), rtol=1e-9, atol=1e-9
+        )
         assert close.mean() > 0.99
     limit = float(np.quantile(every, share))
-    index, found = scan_grid(cost, grid, limit)
+    index, found = scan_grid(cost, grid, limit=limit)
     np.testing.assert_array_equal(index, np.flatnonzero(every < limit))
     np.testing.assert_array_equal(found, every[index])
     below = cost.evaluate(inverse(poses), limit=limit)
@@ -134,9 +138,9 @@ BOX = PlausibleSettings(epsilon=0.01, cost=EvaluationCostSettings(lookup="trilin
 
 def test_the_set_holds_the_true_pose_and_nothing_that_costs_more_than_epsilon_above_it():
     problem, truth = touched_box()
-    found = plausible_set(problem, truth, BOX)
+    found = plausible_set(problem, truth, settings=BOX)
     np.testing.assert_array_equal(found.truth, truth)
-    exact = brute_force(problem, found.world_from_object, BOX.cost)
+    exact = brute_force(problem, found.world_from_object, by=BOX.cost)
     np.testing.assert_allclose(found.cost, exact, atol=1e-12)
     assert (found.cost < found.true_cost + BOX.epsilon).all()
     assert len(found.cost) == BOX.fill_to
@@ -147,9 +151,9 @@ def test_the_set_holds_the_true_pose_and_nothing_that_costs_more_than_epsilon_ab
 def test_a_thin_set_is_filled_too():
     problem, truth = touched_box()
     by = replace(BOX, epsilon=0.0005, fill_to=300)
-    found = plausible_set(problem, truth, by)
+    found = plausible_set(problem, truth, settings=by)
     assert len(found.cost) == by.fill_to
-    exact = brute_force(problem, found.world_from_object, by.cost)
+    exact = brute_force(problem, found.world_from_object, by=by.cost)
     assert (exact < found.true_cost + by.epsilon).all()
     assert len(np.unique(found.world_from_object.reshape(-1, 16), axis=0)) == by.fill_to
 
@@ -157,18 +161,18 @@ def test_a_thin_set_is_filled_too():
 def test_threads_change_nothing():
     problem, truth = touched_box()
     by = replace(BOX, grid=replace(SMALL, rotations=1000), epsilon=0.03)
-    alone = plausible_set(problem, truth, by)
+    alone = plausible_set(problem, truth, settings=by)
     assert len(alone.index) > 50
     with threads(2):
-        assert plausible_set(problem, truth, by).digest == alone.digest
+        assert plausible_set(problem, truth, settings=by).digest == alone.digest
 
 
 def test_what_the_true_pose_violates_is_allowed_to_others():
     problem, truth = touched_box()
     with_one = np.concatenate([problem.points.free, truth[None, :3, 3]])
     violated = replace(problem, points=replace(problem.points, free=with_one))
-    strict = plausible_set(problem, truth, BOX)
-    lenient = plausible_set(violated, truth, BOX)
+    strict = plausible_set(problem, truth, settings=BOX)
+    lenient = plausible_set(violated, truth, settings=BOX)
     assert lenient.true_cost == pytest.approx(strict.true_cost + BOX.cost.violation / len(with_one))
     assert len(lenient.index) >= len(strict.index) > 0
 
@@ -176,27 +180,27 @@ def test_what_the_true_pose_violates_is_allowed_to_others():
 def test_more_members_than_are_kept_are_a_random_subset_with_the_true_pose():
     problem, truth = touched_box(free=False)
     by = replace(BOX, epsilon=0.05, members=40)
-    found = plausible_set(problem, truth, by)
+    found = plausible_set(problem, truth, settings=by)
     assert len(found.index) > 100
     assert len(found.cost) in (39, 40)  # the grid holds the true pose, too
     np.testing.assert_array_equal(found.truth, truth)
-    assert plausible_set(problem, truth, by).digest == found.digest
+    assert plausible_set(problem, truth, settings=by).digest == found.digest
     seeded = replace(problem, key=StreamKey(8, 2))
-    assert plausible_set(seeded, truth, by).digest != found.digest
+    assert plausible_set(seeded, truth, settings=by).digest != found.digest
 
 
 def test_the_rotations_are_the_same_at_every_step_of_a_session():
     problem, truth = touched_box()
     later = replace(problem, key=StreamKey(7, 9))
-    found = plausible_set(problem, truth, BOX)
-    assert plausible_set(later, truth, BOX).digest == found.digest
+    found = plausible_set(problem, truth, settings=BOX)
+    assert plausible_set(later, truth, settings=BOX).digest == found.digest
 
 
 def test_too_many_members_are_one_clear_error(monkeypatch):
     monkeypatch.setattr(pose_scan, "MOST_MEMBERS", 10)
     problem, truth = touched_box()
     with pytest.raises(EvaluationError, match="more than 10 poses cost less than"):
-        plausible_set(problem, truth, replace(BOX, epsilon=0.05))
+        plausible_set(problem, truth, settings=replace(BOX, epsilon=0.05))
 
 
 @pytest.mark.parametrize("points", ["known", "free", "occupied"])
@@ -206,7 +210,7 @@ def test_a_single_point_of_any_class_has_a_set(points, definition):
     problem = replace(problem, points=KnownPoints(**{points: truth[None, :3, 3]}))
     by = plausible_settings(definition, 0.001)
     by = replace(by, grid=replace(by.grid, offsets=SMALL.offsets, rotations=150))
-    found = plausible_set(problem, truth, by)
+    found = plausible_set(problem, truth, settings=by)
     assert len(found.cost) >= 1
     assert np.isfinite(found.cost).all()
 
@@ -216,15 +220,15 @@ def test_the_definitions_have_the_grids_that_their_sources_name():
         plausible_settings(name, 0.001) for name in ("paper", "reference", "default")
     )
     truth = np.eye(4)
-    assert len(grid_around(truth, paper.grid, 0)) == 33_750_000
-    assert len(grid_around(truth, default.grid, 0)) == 3375 * 10_101
-    grid = grid_around(truth, reference.grid, 5)
+    assert len(grid_around(truth, paper.grid, seed=0)) == 33_750_000
+    assert len(grid_around(truth, default.grid, seed=0)) == 3375 * 10_101
+    grid = grid_around(truth, reference.grid, seed=5)
     assert len(grid) == 3150 * 10_000
     assert grid.positions.min(axis=0).tolist() == [-0.1, -0.2, 0.0]
     assert grid.positions.max(axis=0).tolist() == [0.3, 0.2, 0.1]
     np.testing.assert_allclose(rotation_angle(grid.rotations[100]), 0.0, atol=1e-9)
     np.testing.assert_allclose(grid.rotations[:100, 2], [[0.0, 0.0, 1.0]] * 100, atol=1e-15)
-    extents = grid_around(truth, default.grid, 5).positions[[0, -1]]
+    extents = grid_around(truth, default.grid, seed=5).positions[[0, -1]]
     np.testing.assert_allclose(extents, [[-0.1, -0.2, 0.0], [0.15, 0.2, 0.1]], atol=1e-15)
     for name, combine, tolerance in (
         ("default", "means", 0.01),
@@ -240,7 +244,7 @@ def test_the_definitions_have_the_grids_that_their_sources_name():
     seeded = [replace(problem, key=StreamKey(seed, 0)) for seed in (5, 6)]
     assert len({rotation_seed(each, reference) for each in seeded}) == 1
     assert len({rotation_seed(each, default) for each in seeded}) == 2
-    assert (grid_around(truth, reference.grid, 6).rotations != grid.rotations).any()
+    assert (grid_around(truth, reference.grid, seed=6).rotations != grid.rotations).any()
 
 
 @pytest.mark.parametrize(
@@ -259,12 +263,12 @@ def test_a_setting_that_cannot_be_is_named(make, message):
 def test_a_true_pose_that_is_not_rigid_is_named():
     problem, truth = touched_box()
     with pytest.raises(PoseError, match="world_from_object"):
-        plausible_set(problem, 2.0 * truth, BOX)
+        plausible_set(problem, 2.0 * truth, settings=BOX)
 
 
 SETTINGS = PlausibleSettings(
     epsilon=0.02,
-    grid=PoseGridSettings(Offsets(((-0.02, 0.02, 3),), ((0.0, 0.0, 1),), ((0.0, 0.0, 1),)), 20),
+    grid=PoseGridSettings(Offsets(((-0.02, 0.02, 3),), ((0.0, 0.0, 1),), z=((0.0, 0.0, 1),)), 20),
     modes=ModeSearchSettings(starts=5),
 )
 
@@ -275,18 +279,18 @@ def made():
     contact = apply(truth, np.array([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]))
     points = replace(problem.points, free=np.zeros((0, 3)), known=contact, known_sdf=None)
     problem = replace(problem, points=replace(points, occupied=np.zeros((0, 3))))
-    return problem, truth, plausible_set(problem, truth, SETTINGS)
+    return problem, truth, plausible_set(problem, truth, settings=SETTINGS)
 
 
 def test_a_set_is_read_as_it_was_written_and_named_by_its_points(made, tmp_path):
     problem, truth, found = made
     assert len(found.index) > 3
-    assert load_plausible(tmp_path, problem, SETTINGS) is None
+    assert load_plausible(tmp_path, problem, settings=SETTINGS) is None
     path = save_plausible(tmp_path / "sets", found)
     assert path.name.startswith(problem.points.digest)
-    assert path == plausible_path(tmp_path / "sets", problem, SETTINGS)
+    assert path == plausible_path(tmp_path / "sets", problem, settings=SETTINGS)
     assert [file.name for file in path.parent.iterdir()] == [path.name]
-    read = load_plausible(path.parent, problem, SETTINGS, world_from_object=truth)
+    read = load_plausible(path.parent, problem, settings=SETTINGS, world_from_object=truth)
     assert read.digest == found.digest
     assert (read.settings, read.seed) == (SETTINGS, 7)
     assert read.true_cost == found.true_cost
@@ -304,11 +308,11 @@ def test_other_points_definitions_and_seeds_have_files_of_their_own(made, tmp_pa
         (problem, replace(SETTINGS, epsilon=0.021)),
         (problem, replace(SETTINGS, modes=None)),
     ]
-    names = {plausible_path(tmp_path, *other).name for other in others}
+    names = {plausible_path(tmp_path, other[0], settings=other[1]).name for other in others}
     assert len(names | {path.name}) == 6
-    assert all(load_plausible(tmp_path, *other) is None for other in others)
+    assert all(load_plausible(tmp_path, other[0], settings=other[1]) is None for other in others)
     later = replace(problem, key=StreamKey(7, 9))
-    assert plausible_path(tmp_path, later, SETTINGS) == path
+    assert plausible_path(tmp_path, later, settings=SETTINGS) == path
 
 
 def test_a_set_around_another_true_pose_is_refused(made, tmp_path):
@@ -317,7 +321,7 @@ def test_a_set_around_another_true_pose_is_refused(made, tmp_path):
     moved = truth.copy()
     moved[0, 3] += 0.001
     with pytest.raises(EvaluationError, match="or another true pose"):
-        load_plausible(tmp_path, problem, SETTINGS, world_from_object=moved)
+        load_plausible(tmp_path, problem, settings=SETTINGS, world_from_object=moved)
 
 
 def test_what_was_changed_after_it_was_written_is_refused(made, tmp_path):
@@ -332,7 +336,7 @@ def test_what_was_changed_after_it_was_written_is_refused(made, tmp_path):
     ]:
         np.savez(path.open("wb"), **{**arrays, name: value})
         with pytest.raises(EvaluationError, match=message):
-            load_plausible(tmp_path, problem, SETTINGS)
+            load_plausible(tmp_path, problem, settings=SETTINGS)
 
 
 def test_a_folder_that_cannot_be_written_is_named(made, tmp_path):

@@ -39,7 +39,9 @@ def box():
 def distance_of(thing, count=200, **values):
     sdf, mesh = thing
     by = replace(DistanceSettings(), **values)
-    return SurfaceDistance(sdf, mesh, surface_points(mesh, count, StreamKey(0, 0)), by)
+    return SurfaceDistance(
+        sdf, mesh, points=surface_points(mesh, count, key=StreamKey(0, 0)), settings=by
+    )
 
 
 def poses(seed, count, *, spread=0.03, angle=0.3):
@@ -51,7 +53,8 @@ def poses(seed, count, *, spread=0.03, angle=0.3):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_ball_may_turn_as_it_likes_and_a_shift_costs_a_third_of_its_square(ball, method):
     """For a shift t much less than the radius: | |r n + t| - r | = |n . t|, whose mean square
-    over directions n is t^2 / 3."""
+    over directions n is t^2 / 3.
+    """
     distance = distance_of(ball, 4000, method=method)
     stream = np.random.default_rng(0)
     turned = compose(random_rotations(stream, 4), np.zeros((4, 3)))
@@ -68,7 +71,8 @@ def test_a_ball_may_turn_as_it_likes_and_a_shift_costs_a_third_of_its_square(bal
 @pytest.mark.parametrize("method", METHODS)
 def test_a_box_shifted_along_a_side_costs_what_its_faces_move(box, method):
     """For a shift d: one end comes out by d; the other goes in by d, but is nearer to a side in
-    a frame of width d; the sides slide along themselves, but for a strip beyond the edge."""
+    a frame of width d; the sides slide along themselves, but for a strip beyond the edge.
+    """
     shift, count = 0.01, 20_000
     a, b, c = SIDES
     ends = 2.0 * a * b * shift**2
@@ -81,7 +85,8 @@ def test_a_box_shifted_along_a_side_costs_what_its_faces_move(box, method):
 
 
 def test_methods_agree_where_the_metrics_look(box):
-    estimates, members = inverse(poses(1, 12)), poses(2, 25)
+    estimates = inverse(poses(1, 12))
+    members = poses(2, 25)
     exact = distance_of(box, method="exact").between(estimates, members)
     nearest = distance_of(box, method="nearest").between(estimates, members)
     grid = distance_of(box, method="grid").between(estimates, members)
@@ -89,7 +94,7 @@ def test_methods_agree_where_the_metrics_look(box):
     np.testing.assert_array_equal(nearest.min(axis=1), exact.min(axis=1))
     assert 0 < (nearest == exact).sum() < exact.size
     np.testing.assert_allclose(grid, exact, rtol=0.1, atol=1.0)
-    points = surface_points(box[1], 200, StreamKey(0, 0))
+    points = surface_points(box[1], 200, key=StreamKey(0, 0))
     seen = (estimates[3] @ members[4])[:3]
     signed = mesh_sdf(box[1], points @ seen[:, :3].T + seen[:, 3])[0]
     assert exact[3, 4] == pytest.approx(1e6 * (signed**2).mean())
@@ -105,20 +110,21 @@ def test_coverage_and_plausibility_are_the_means_of_the_nearest():
 
 def test_threads_change_nothing(box):
     distance = distance_of(box)
-    estimates, members = inverse(poses(11, 9)), poses(12, 8)
+    estimates = inverse(poses(11, 9))
+    members = poses(12, 8)
     alone = distance.between(estimates, members)
     with threads(2):
         np.testing.assert_array_equal(distance.between(estimates, members), alone)
 
 
 def test_surface_points_lie_on_the_surface_and_are_uniform_by_area(box):
-    points = surface_points(box[1], 20_000, StreamKey(4, 0))
+    points = surface_points(box[1], 20_000, key=StreamKey(4, 0))
     assert np.abs(mesh_sdf(box[1], points)[0]).max() < 1e-12
     a, b, c = SIDES
     on_top = (points[:, 2] > c / 2.0 - 1e-9).mean()
     assert on_top == pytest.approx(a * b / (2.0 * (a * b + b * c + c * a)), abs=0.01)
-    np.testing.assert_array_equal(points, surface_points(box[1], 20_000, StreamKey(4, 0)))
-    assert (points != surface_points(box[1], 20_000, StreamKey(5, 0))).any()
+    np.testing.assert_array_equal(points, surface_points(box[1], 20_000, key=StreamKey(4, 0)))
+    assert (points != surface_points(box[1], 20_000, key=StreamKey(5, 0))).any()
 
 
 def test_the_cheapest_share_of_hypotheses_is_told_by_cost():
@@ -131,16 +137,19 @@ def test_the_cheapest_share_of_hypotheses_is_told_by_cost():
 
 def test_a_truth_far_from_all_hypotheses_is_outside_of_their_spread(box):
     estimates = inverse(poses(13, 30, spread=0.01, angle=0.1))
-    distance, away = distance_of(box, method="exact"), np.eye(4)
-    assert true_pose_rank(distance, estimates, away) > 0.5
+    distance = distance_of(box, method="exact")
+    away = np.eye(4)
+    assert true_pose_rank(distance, estimates, world_from_object=away) > 0.5
     away[0, 3] = 0.15
-    assert true_pose_rank(distance, estimates, away) == pytest.approx(1.0 / 31.0)
+    assert true_pose_rank(distance, estimates, world_from_object=away) == pytest.approx(1.0 / 31.0)
 
 
 def test_the_rank_of_a_truth_drawn_like_the_hypotheses_is_uniform(box):
     distance = distance_of(box, 30, method="grid")
     drawn = poses(14, 80 * 10, spread=0.02, angle=0.2).reshape(80, 10, 4, 4)
-    ranks = [true_pose_rank(distance, inverse(some[1:]), some[0]) for some in drawn]
+    ranks = [
+        true_pose_rank(distance, inverse(some[1:]), world_from_object=some[0]) for some in drawn
+    ]
     counts = np.bincount(np.rint(10.0 * np.array(ranks)).astype(int), minlength=11)[1:]
     assert counts.sum() == 80
     assert ((counts - 8.0) ** 2 / 8.0).sum() < 23.6  # chi square, 9 degrees, 0.5 %
@@ -152,8 +161,10 @@ def test_what_cannot_be_measured_is_named(box):
     with pytest.raises(PoseError, match="pose 1 is not finite"):
         distance_of(box).between(broken, poses(0, 2))
     with pytest.raises(SettingError, match="method exact needs a mesh"):
-        SurfaceDistance(box[0], None, np.zeros((1, 3)), DistanceSettings(method="exact"))
+        SurfaceDistance(
+            box[0], None, points=np.zeros((1, 3)), settings=DistanceSettings(method="exact")
+        )
     with pytest.raises(EvaluationError, match="the rank among 1 hypotheses"):
-        true_pose_rank(distance_of(box), poses(0, 1), np.eye(4))
+        true_pose_rank(distance_of(box), poses(0, 1), world_from_object=np.eye(4))
     with pytest.raises(EvaluationError, match="distances have shape"):
         plausible_diversity(np.zeros((0, 3)))

@@ -62,7 +62,7 @@ def cube_rotations():
     return np.array([one for one in signed if np.linalg.det(one) > 0.0])
 
 
-def assert_same_set(found, expected, within=1e-6):
+def assert_same_set(found, expected, *, within=1e-6):
     assert len(found) == len(expected)
     apart = np.abs(found[:, None] - expected).max(axis=(2, 3))
     assert (apart.min(axis=0) < within).all()
@@ -220,7 +220,8 @@ def test_the_centre_is_where_every_symmetry_leaves_it():
     mesh.apply_translation([7.0, -3.0, 0.5])
     np.testing.assert_allclose(object_symmetry(mesh).centre, [7.0, -3.0, 0.5], atol=1e-12)
     cone = trimesh.creation.cone(0.3, 0.4, sections=256)  # from z = 0 to 0.4, slant 0.5
-    areas, heights = np.array([0.3**2, 0.3 * 0.5]), np.array([0.0, 0.4 / 3])
+    areas = np.array([0.3**2, 0.3 * 0.5])
+    heights = np.array([0.0, 0.4 / 3])
     expected = [0.0, 0.0, areas @ heights / areas.sum()]
     np.testing.assert_allclose(object_symmetry(cone).centre, expected, atol=1e-5)
 
@@ -250,7 +251,7 @@ def test_without_a_mesh_there_is_the_centre_of_the_grid_alone():
     found = grid_symmetry(SdfGrid.from_mesh(mesh, 0.01))
     assert_same_set(found.rotations, np.eye(3)[None])
     np.testing.assert_allclose(found.centre, [0.4, 0.0, 0.1], atol=0.005)
-    thin = SdfGrid(np.zeros(3), 0.1, np.ones((2, 3, 4)), np.ones((2, 3, 4, 3)))
+    thin = SdfGrid(np.zeros(3), 0.1, values=np.ones((2, 3, 4)), gradients=np.ones((2, 3, 4, 3)))
     np.testing.assert_allclose(grid_symmetry(thin).centre, [0.05, 0.1, 0.15])
 
 
@@ -280,15 +281,17 @@ def test_the_true_pose_is_found_from_a_guess_some_centimetres_off():
     problem, truth = scene(np.random.default_rng(3), box(HALF, 0.01))
     stream = np.random.default_rng(0)
     sides = stream.uniform(-0.9, 0.9, (60, 3))
-    axis, sign = np.arange(60) % 3, np.where(np.arange(60) % 2, 1.0, -1.0)
+    axis = np.arange(60) % 3
+    sign = np.where(np.arange(60) % 2, 1.0, -1.0)
     sides[np.arange(60), axis] = sign
     nodes = stream.uniform(-0.3, 0.3, (2000, 3))
     free = nodes[(np.abs(nodes) > HALF + 0.002).any(axis=1)]
     points = KnownPoints(free=apply(truth, free), known=apply(truth, sides * HALF))
     problem = replace(problem, points=points)
-    turn, shift = rotation_vector(np.array([0.02, -0.01, 0.015])), np.array([0.05, -0.06, 0.03])
+    turn = rotation_vector(np.array([0.02, -0.01, 0.015]))
+    shift = np.array([0.05, -0.06, 0.03])
     guess = compose(turn @ truth[:3, :3], truth[:3, 3] + shift)
-    found = find_true_pose(problem, guess, QUICK)
+    found = find_true_pose(problem, guess, settings=QUICK)
     offset = found.world_from_object[:3, 3] - truth[:3, 3]
     assert np.sqrt((offset**2).sum()) < 0.004
     left = found.world_from_object[:3, :3] @ truth[:3, :3].T
@@ -296,7 +299,7 @@ def test_the_true_pose_is_found_from_a_guess_some_centimetres_off():
     assert found.cost < 0.1 * found.guess_cost
     cost = EvaluationCost(problem, QUICK.cost)
     assert found.cost == cost.evaluate(inverse(found.world_from_object)[None])[0]
-    assert find_true_pose(problem, guess, replace(QUICK, passes=1)).cost >= found.cost
+    assert find_true_pose(problem, guess, settings=replace(QUICK, passes=1)).cost >= found.cost
 
 
 def test_every_pass_looks_closer(monkeypatch):
@@ -305,14 +308,14 @@ def test_every_pass_looks_closer(monkeypatch):
     seen: list[PoseGrid] = []
 
     def watched(centre, offsets, rotations):
-        seen.append(PoseGrid(centre, offsets, rotations))
+        seen.append(PoseGrid(centre, offsets, rotations=rotations))
         return seen[-1]
 
     monkeypatch.setattr(pose_scan, "PoseGrid", watched)
     settings = replace(QUICK, reach=0.08, spacing=0.02, rotations=400, angle=0.2, passes=3)
-    best = find_true_pose(problem, truth, replace(settings, passes=2)).world_from_object
+    best = find_true_pose(problem, truth, settings=replace(settings, passes=2)).world_from_object
     seen.clear()
-    find_true_pose(problem, truth, settings)
+    find_true_pose(problem, truth, settings=settings)
     np.testing.assert_array_equal(seen[2].centre, best[:3, 3])
     for grid, closer in zip(seen, (1.0, 0.25, 0.0625), strict=True):
         offsets = grid.offsets.points()
@@ -327,7 +330,7 @@ def test_a_guess_that_nothing_beats_stays():
     problem, truth = scene(np.random.default_rng(3), box(HALF))
     problem = replace(problem, points=KnownPoints(known=truth[None, :3, 3], known_sdf=[-0.06]))
     by = EvaluationCost(problem, QUICK.cost).evaluate(inverse(truth)[None])[0]
-    found = find_true_pose(problem, truth, QUICK)
+    found = find_true_pose(problem, truth, settings=QUICK)
     assert found.cost <= by == found.guess_cost
 
 
@@ -336,4 +339,4 @@ def test_what_cannot_be_searched_is_named():
     with pytest.raises(PoseError, match="guess"):
         find_true_pose(problem, np.ones((4, 4)))
     with pytest.raises(SettingError, match="the number of offsets is"):
-        find_true_pose(problem, np.eye(4), TruePoseSettings(spacing=0.001))
+        find_true_pose(problem, np.eye(4), settings=TruePoseSettings(spacing=0.001))

@@ -92,7 +92,7 @@ def test_random_takes_every_available_action_as_often():
 def test_gains_are_a_second_and_other_ratings_are_not(name):
     actions = along_x(PLACES)
     seconds = np.array([1.0, 2.0, 4.0, 1.0])
-    timed = Actions(actions.world_from_hand, actions.length, seconds)
+    timed = Actions(actions.world_from_hand, actions.length, seconds=seconds)
     usual = build_policy(name).decide(ball_problem(TWO, actions))
     decision = build_policy(name).decide(ball_problem(TWO, timed))
     divisor = 1.0 if name in ("grid", "random", "nearest_mean") else seconds
@@ -101,7 +101,8 @@ def test_gains_are_a_second_and_other_ratings_are_not(name):
 
 def test_no_gain_is_promised_by_an_action_that_cannot_be_taken():
     """The last action misses both places of the ball, the first tells them apart."""
-    policy, actions = build_policy("information"), along_x(PLACES)
+    policy = build_policy("information")
+    actions = along_x(PLACES)
     for available, chosen, stop in (([3], -1, "gain"), ([0, 3], 0, "")):
         flags = np.isin(np.arange(4), available)
         decision = policy.decide(ball_problem(TWO, actions, available=flags))
@@ -134,15 +135,15 @@ def test_a_session_ends_by_the_spread_where_the_result_is_determined_alone(sprea
 def test_rules_to_stop_grow_with_the_object(scale):
     rules = StopSettings()
     diameter = 0.2 * scale
-    assert rules.is_narrow(0.0299 * diameter, diameter, "")
-    assert not rules.is_narrow(0.0301 * diameter, diameter, "")
-    assert rules.is_narrow(0.1, diameter, "determined")  # the verdict itself is relative
+    assert rules.is_narrow(0.0299 * diameter, diameter, verdict="")
+    assert not rules.is_narrow(0.0301 * diameter, diameter, verdict="")
+    assert rules.is_narrow(0.1, diameter, verdict="determined")  # the verdict itself is relative
     assert rules.is_useless(0.00099 * diameter, diameter)
     assert not rules.is_useless(0.00101 * diameter, diameter)
     recorded = StopSettings(spread=0.010, gain=0.0005)
-    assert recorded.is_narrow(0.0099, diameter, "")
+    assert recorded.is_narrow(0.0099, diameter, verdict="")
     assert recorded.is_useless(0.00049, diameter)
-    assert not recorded.is_narrow(0.0101, diameter, "")
+    assert not recorded.is_narrow(0.0101, diameter, verdict="")
 
 
 def test_an_unknown_verdict_is_refused():
@@ -209,7 +210,8 @@ def swept_by_definition(problem):
         for a, hand in enumerate(problem.actions.world_from_hand):
             x, y, z = apply(inverse(hand), centre[None])[0]
             near = np.floor(([x, y] - front.lower) / front.cell).astype(int)
-            lower, upper = np.maximum(near - 5, 0), np.maximum(near + 6, 0)
+            lower = np.maximum(near - 5, 0)
+            upper = np.maximum(near + 6, 0)
             depth = z - front.heights[lower[0] : upper[0], lower[1] : upper[1]].max(initial=-np.inf)
             if 0.0 <= depth <= problem.actions.length[a]:
                 swept[a] += entropy[tuple(voxel)] * weights[travel[:, a] >= depth].sum()
@@ -219,7 +221,7 @@ def swept_by_definition(problem):
 @pytest.mark.parametrize("known", [False, True])
 def test_the_entropy_swept_is_that_of_the_definition(known):
     places = np.random.default_rng(1).uniform(-0.2, 0.2, (300, 3))
-    points = KnownPoints(places[:100], places[100:200], places[200:]) if known else None
+    points = KnownPoints(places[:100], places[100:200], known=places[200:]) if known else None
     problem = some_problem(points)
     policy = build_policy("voxel_entropy", {"voxel": SIDE})
     rated = policy.rate(problem, Forecast(problem, 0.005))

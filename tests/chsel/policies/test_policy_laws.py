@@ -91,7 +91,8 @@ def test_of_an_action_that_is_offered_twice_the_first_is_taken(name):
 def test_a_decision_turns_with_the_world_about_the_vertical(name):
     """By a quarter turn, which takes the workspace and its voxels onto themselves."""
     turn = compose(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
-    usual, before = decided(name, problem()), problem()
+    usual = decided(name, problem())
+    before = problem()
     actions = Actions(turn @ before.actions.world_from_hand, before.actions.length)
     belief = WeightedPoses(before.belief.object_from_world @ inverse(turn), before.belief.weights)
     found = decided(name, replace(before, actions=actions, belief=belief))

@@ -27,7 +27,7 @@ RESULT = replace(hypotheses_at(POSES), elites=np.concatenate([POSES, inverse(POS
 
 
 def test_first_of_the_updated_set_is_the_best_pose_to_the_bit():
-    updated = updated_initial_set(RESULT, KEY, OnlineSettings())
+    updated = updated_initial_set(RESULT, KEY, settings=OnlineSettings())
     assert updated[0].tobytes() == POSES[0].tobytes()
     assert not (updated[1:] == updated[0]).all(axis=(1, 2)).any()
 
@@ -37,7 +37,7 @@ def test_first_of_the_updated_set_is_the_best_pose_to_the_bit():
 )
 def test_update_noise_has_the_set_deviations_and_its_axes_are_uniform_on_the_sphere(law, angle_rms):
     settings = OnlineSettings(hypotheses=MANY, rotation_law=law, keep_best=False)
-    world = inverse(updated_initial_set(RESULT, KEY, settings))
+    world = inverse(updated_initial_set(RESULT, KEY, settings=settings))
     best = inverse(POSES[0])
     deviation = (world[:, :3, 3] - best[:3, 3]).std(axis=0)
     np.testing.assert_allclose(deviation, 0.05, rtol=0.01)
@@ -51,11 +51,14 @@ def test_update_noise_has_the_set_deviations_and_its_axes_are_uniform_on_the_sph
 
 def first_set(points=None, **changes):
     settings = OnlineSettings(**changes)
-    return inverse(first_initial_set(WORKSPACE, points or KnownPoints(), KEY, settings))
+    return inverse(
+        first_initial_set(WORKSPACE, points or KnownPoints(), key=KEY, settings=settings)
+    )
 
 
 def test_first_set_is_uniform_in_workspace_and_rotations():
-    world, (lower, upper) = first_set(hypotheses=MANY), WORKSPACE.bounds
+    world = first_set(hypotheses=MANY)
+    (lower, upper) = WORKSPACE.bounds
     places = world[:, :3, 3]
     assert (places >= lower).all()
     assert (places <= upper).all()
@@ -82,6 +85,14 @@ def test_centroid_starts_lie_around_the_mean_contact_whatever_else_is_known():
 @pytest.mark.parametrize(("choice", "count"), [("elites", 6), ("estimates", 3), ("none", 0)])
 def test_low_cost_set_is_what_is_chosen(choice, count):
     settings = OnlineSettings(low_cost_set=choice)
-    problem = pose_problem(GRID, POINTS, WORKSPACE, 0.01, KEY, settings, RESULT)
+    problem = pose_problem(
+        GRID,
+        POINTS,
+        workspace=WORKSPACE,
+        free_resolution=0.01,
+        key=KEY,
+        settings=settings,
+        previous=RESULT,
+    )
     np.testing.assert_array_equal(problem.low_cost_set, RESULT.elites[:count])
     assert problem.initial_set.shape == (30, 4, 4)

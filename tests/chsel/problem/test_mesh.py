@@ -205,7 +205,9 @@ def test_the_unit_that_a_file_states_counts_and_scale_multiplies_it(
     tmp_path, file_name, unit, metres, length
 ):
     write = collada if file_name.endswith("dae") else three_mf
-    write(tmp_path / file_name, unit, BOX.vertices * 10.0, BOX.faces)  # 1 x 2 x 3 units
+    write(
+        tmp_path / file_name, unit, vertices=BOX.vertices * 10.0, faces=BOX.faces
+    )  # 1 x 2 x 3 units
     for scale in (1.5, 2.0):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -217,7 +219,12 @@ def test_the_unit_that_a_file_states_counts_and_scale_multiplies_it(
 
 
 def test_an_error_about_the_size_names_the_unit_of_the_file(tmp_path):
-    collada(tmp_path / "a.dae", '<unit meter="0.0254"/>', BOX.vertices * 2000.0, BOX.faces)
+    collada(
+        tmp_path / "a.dae",
+        '<unit meter="0.0254"/>',
+        vertices=BOX.vertices * 2000.0,
+        faces=BOX.faces,
+    )
     with (
         pytest.warns(MeshWarning, match=r"states its unit, 0\.0254 m, which scale multiplies"),
         pytest.raises(MeshError, match=r"a\.dae \(unit 0\.0254 m, times scale\) is 5\.08 x"),

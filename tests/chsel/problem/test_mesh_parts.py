@@ -36,7 +36,7 @@ def clean(*parts):
     return mesh, {w.message.code: str(w.message) for w in caught}
 
 
-def inside(points, solids, cavities):
+def inside(points, solids, *, cavities):
     def within(boxes):
         of_each = [box_distance(points - np.array(at), np.array(size)) < 0.0 for size, at in boxes]
         return np.any(of_each, axis=0) if boxes else np.zeros(len(points), dtype=bool)
@@ -44,7 +44,7 @@ def inside(points, solids, cavities):
     return within(solids) & ~within(cavities)
 
 
-def check(mesh, solids, cavities=()):
+def check(mesh, solids, *, cavities=()):
     """Compare with the distance to points on the boundary of boxes without other boxes."""
     surface, normals = [], []
     for size, position in (*solids, *cavities):
@@ -52,12 +52,16 @@ def check(mesh, solids, cavities=()):
         points, face = trimesh.sample.sample_surface(one, 100_000, seed=0)
         surface.append(points)
         normals.append(one.face_normals[face])
-    surface, step = np.concatenate(surface), 1e-7 * np.concatenate(normals)
-    ends = [inside(surface + side * step, solids, cavities) for side in (-1.0, 1.0)]
+    surface = np.concatenate(surface)
+    step = 1e-7 * np.concatenate(normals)
+    ends = [inside(surface + side * step, solids, cavities=cavities) for side in (-1.0, 1.0)]
     outer = cKDTree(surface[ends[0] != ends[1]])
-    lower, upper = np.min(surface, axis=0) - 0.02, np.max(surface, axis=0) + 0.02
+    lower = np.min(surface, axis=0) - 0.02
+    upper = np.max(surface, axis=0) + 0.02
     points = np.random.default_rng(0).uniform(lower, upper, (3000, 3))
-    expected = outer.query(points)[0] * np.where(inside(points, solids, cavities), -1.0, 1.0)
+    expected = outer.query(points)[0] * np.where(
+        inside(points, solids, cavities=cavities), -1.0, 1.0
+    )
     np.testing.assert_allclose(mesh_sdf(mesh, points)[0], expected, atol=5e-3)
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
@@ -140,26 +144,24 @@ def test_cavities_are_inside_of_material_and_look_inward(inward):
     """Also where all is mirrored; a part that looks outward there is swallowed."""
     hollow = box(*CUBE, inward=inward), box(*INNER, inward=not inward)
     mesh, said = clean(*hollow)
-    check(mesh, [CUBE], [INNER])
+    check(mesh, [CUBE], cavities=[INNER])
     assert said == {}
     handle = (0.1, 0.02, 0.02), (0.09, 0.0, 0.0)
     mesh, _ = clean(*hollow, box(*handle, inward=inward))
-    check(mesh, [CUBE, handle], [INNER])
+    check(mesh, [CUBE, handle], cavities=[INNER])
     mesh, said = clean(box(*CUBE, inward=inward), box(*INNER, inward=inward))
     check(mesh, [CUBE])
     assert said == {}
-    core = (0.02, 0.02, 0.02), (0.0, 0.0, 0.0)
-    mesh, _ = clean(*hollow, box(*core, inward=inward))
+    mesh, _ = clean(*hollow, box((0.02, 0.02, 0.02), (0.0, 0.0, 0.0), inward=inward))
     assert mesh.volume == pytest.approx(0.1**3 - 0.06**3 + 0.02**3)
 
 
 def test_a_mirrored_part_is_turned_with_its_cavity_and_one_that_touches_is_no_cavity():
     far = (0.3, 0.3, 0.3), (0.3, 0.0, 0.0)
     mesh, said = clean(box(*CUBE, inward=True), box(*INNER), box(*far))
-    check(mesh, [CUBE, far], [INNER])
+    check(mesh, [CUBE, far], cavities=[INNER])
     assert "a part of tool, the one of 0.1 x 0.1 x 0.1 m around (0, 0, 0) m" in said["inward_part"]
-    touching = (0.06, 0.06, 0.06), (0.02, 0.0, 0.0)
-    mesh, said = clean(box(*CUBE), box(*touching, inward=True))
+    mesh, said = clean(box(*CUBE), box((0.06, 0.06, 0.06), (0.02, 0.0, 0.0), inward=True))
     check(mesh, [CUBE])
     assert list(said) == ["inward_part"]
 

@@ -67,26 +67,27 @@ def test_points_at_a_place_that_was_measured_count_once():
         for point in points:
             expected.append(min(np.linalg.norm(point - other) for other in kept) > 0.003)
             kept += [point] if expected[-1] else []
-        assert first_at_place(points, earlier, 0.003).tolist() == expected
-        new, before = KnownPoints(known=points, occupied=points), KnownPoints(known=earlier)
-        distinct, _ = distinct_points(new, before, 0.003)
+        assert first_at_place(points, earlier, apart=0.003).tolist() == expected
+        new = KnownPoints(known=points, occupied=points)
+        before = KnownPoints(known=earlier)
+        distinct, _ = distinct_points(new, before, apart=0.003)
         np.testing.assert_array_equal(distinct.known, points[expected])
         assert len(distinct.occupied) >= len(distinct.known)
     held = np.zeros((100_000, 3))
     held[:3] = [[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]
-    assert np.flatnonzero(first_at_place(held, held[:0], 0.003)).tolist() == [0, 1, 2]
+    assert np.flatnonzero(first_at_place(held, held[:0], apart=0.003)).tolist() == [0, 1, 2]
 
 
 def test_known_points_of_other_distances_are_other_points_and_free_ones_stay():
     points = KnownPoints(free=np.zeros((5, 3)), known=np.zeros((3, 3)), known_sdf=[0.0, 0.02, 0.0])
-    distinct, warnings = distinct_points(points, KnownPoints(), 0.003)
+    distinct, warnings = distinct_points(points, KnownPoints(), apart=0.003)
     assert distinct.sdf.tolist() == [0.0, 0.02]
     assert len(distinct.free) == 5
     (warning,) = warnings
     assert warning.text.startswith("1 of 3 points are within 3 mm of an earlier one; a place")
     scan = KnownPoints(known=np.linspace([0, 0, 0], [0.1, 0, 0], 30))
     close = scan.merged(KnownPoints(known=[[0.0001, 0, 0]]))
-    distinct, warnings = distinct_points(close, KnownPoints(), 0.003)
+    distinct, warnings = distinct_points(close, KnownPoints(), apart=0.003)
     assert (distinct.digest, warnings) == (scan.digest, [])  # so few are no warning
     assert [same_place(size) for size in (1.0, 0.04)] == [0.003, 0.002]
 
@@ -129,7 +130,7 @@ GOOD = KnownPoints(free=AROUND[(np.abs(AROUND) > BOX.extents / 2).any(axis=1)], 
 
 def check(codes, workspace=None, **points):
     """The texts of the warnings about points, which have these codes."""
-    found = check_points(KnownPoints(**points), DIAMETER, SIDE, workspace)
+    found = check_points(KnownPoints(**points), DIAMETER, free_resolution=SIDE, workspace=workspace)
     assert [warning.code for warning in found] == codes
     return "\n".join(map(str, found))
 
@@ -213,4 +214,4 @@ def test_free_points_alone_say_nothing_about_where_the_object_is():
 def test_fine_voxels_over_a_large_space_take_no_memory():
     """Too many voxels to number them are not looked at."""
     points = KnownPoints(free=[[1.0, 0.0, 0.0]], known=[[0.0, 0.0, 0.0], [4.0, 4.0, 4.0]])
-    assert check_points(points, 10.0, 1e-6) == []
+    assert check_points(points, 10.0, free_resolution=1e-6) == []

@@ -21,19 +21,21 @@ from chsel.session.judging import trust_by
 from tests.chsel.methods.scene import GRID, MESH, SIDE, STANDING, WORKSPACE, known_points
 from tests.chsel.samples import hypotheses_at
 
-X, Y, DIAGONAL = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.6, 0.8, 0.0]
+X = [1.0, 0.0, 0.0]
+Y = [0.0, 1.0, 0.0]
+DIAGONAL = [0.6, 0.8, 0.0]
 SETTINGS = OnlineSettings(hypotheses=4, update="own")
 MOVES = 0.006  # m a push
 
 
 def test_points_move_by_the_sum_of_the_pushes_after_them():
-    pushes = Pushes([X, Y, DIAGONAL], [[1, 0, 1], [1, 1, 2], [2, 1, 2]], 0.02)
+    pushes = Pushes([X, Y, DIAGONAL], [[1, 0, 1], [1, 1, 2], [2, 1, 2]], largest=0.02)
     points = KnownPoints(free=np.zeros((3, 3)), occupied=np.ones((1, 3)), known=np.zeros((3, 3)))
-    now = pushes.carried(points, 0.01, 1e-4)
+    now = pushes.carried(points, 0.01, resolution=1e-4)
     np.testing.assert_allclose(now.free, [[0.016, 0.018, 0.0], [0.006, 0.008, 0.0], [0, 0, 0]])
     np.testing.assert_allclose(now.occupied, [[1.006, 1.018, 1.0]])
     np.testing.assert_allclose(now.known, [[0.016, 0.018, 0.0], [0.006, 0.018, 0.0], [0, 0, 0]])
-    standing = pushes.carried(points, 0.0, 1e-4)  # the free point three times
+    standing = pushes.carried(points, 0.0, resolution=1e-4)  # the free point three times
     assert standing.digest == replace(points, free=np.zeros((1, 3))).digest
 
 
@@ -62,7 +64,7 @@ def loop_of(**options):
     return Loop(GRID, WORKSPACE, free_resolution=SIDE, settings=SETTINGS, **options)
 
 
-def touch(step, points, direction):
+def touch(step, points, *, direction):
     """A touch of a hand on its way in a horizontal direction."""
     pose = np.eye(4)
     pose[:3, 2] = direction
@@ -80,12 +82,13 @@ def pushed(moves):
     """What is known after 12 pushes, each of which moves the L by MOVES, and where it is then."""
     loop = loop_of(moves=moves)
     contacts = known_points(STANDING, 12).known
-    random, pose = np.random.default_rng(3), STANDING.copy()
+    random = np.random.default_rng(3)
+    pose = STANDING.copy()
     for step, contact in enumerate(contacts):
         angle = random.uniform(-np.pi, np.pi)
         direction = np.array([np.cos(angle), np.sin(angle), 0.0])
         since = pose[:3, 3] - STANDING[:3, 3]
-        loop.perceive(touch(step, KnownPoints(known=[contact + since]), direction))
+        loop.perceive(touch(step, KnownPoints(known=[contact + since]), direction=direction))
         pose[:3, 3] += MOVES * direction
     free = KnownPoints(free=known_points(pose, 1).free)
     loop.perceive(Probe(step=0, outcome="free", new_points=free))
@@ -94,7 +97,7 @@ def pushed(moves):
 
 def distance_to(truth, hypotheses):
     poses = Poses.of(hypotheses.object_from_world[:1])
-    return float(outline_distances_to(GRID, poses, Poses.of(inverse(truth[None])))[0])
+    return float(outline_distances_to(GRID, poses, other=Poses.of(inverse(truth[None])))[0])
 
 
 def test_the_distance_of_pushes_is_found_and_the_pose_is_that_of_the_end():
@@ -114,11 +117,13 @@ def test_the_distance_of_pushes_is_found_and_the_pose_is_that_of_the_end():
 
 @pytest.mark.parametrize("moves", [MOVES, 0.0])
 def test_a_session_that_expects_no_moves_notices_that_touches_move_the_object(moves):
-    contacts, random = known_points(STANDING, 12).known, np.random.default_rng(3)
+    contacts = known_points(STANDING, 12).known
+    random = np.random.default_rng(3)
     if moves == 0.0:  # contacts that are off otherwise
         contacts = contacts + random.normal(0.0, 0.003, contacts.shape)
     handle = trimesh.creation.box((0.02, 0.02, 0.02))
-    method, recorder = Anchored(AnchoredSettings(size="small")), ListRecorder()
+    method = Anchored(AnchoredSettings(size="small"))
+    recorder = ListRecorder()
     given = {"resolution": 0.01, "workspace": WORKSPACE, "method": method, "record": recorder}
     with chsel.Session(MESH, **given) as session:
         since = np.zeros(3)
@@ -143,15 +148,17 @@ def test_a_session_that_expects_no_moves_notices_that_touches_move_the_object(mo
 
 
 def test_after_a_push_of_unknown_distance_no_pose_is_determined():
-    points, method = known_points(STANDING, 12), Anchored(AnchoredSettings(size="small"))
+    points = known_points(STANDING, 12)
+    method = Anchored(AnchoredSettings(size="small"))
     loop = loop_of()
     loop.perceive(Probe(step=0, outcome="points", new_points=points))
     problem = loop.problem()
-    found, before = method.register(problem), [[len(points.free), 0, len(points.known)]]
+    found = method.register(problem)
+    before = [[len(points.free), 0, len(points.known)]]
     for largest, verdict in ((0.001, "determined"), (0.03, "wide")):
-        pushed = replace(problem, pushes=Pushes([DIAGONAL], before, largest))
+        pushed = replace(problem, pushes=Pushes([DIAGONAL], before, largest=largest))
         assert method.register(pushed).digest == found.digest
-        assert trust_by(method, pushed, found).verdict == verdict
+        assert trust_by(method, pushed, hypotheses=found).verdict == verdict
 
 
 def test_an_object_that_stands_has_the_same_result_as_if_nobody_spoke_of_pushes():
@@ -197,12 +204,13 @@ def test_the_largest_distance_is_tried_and_found():
 
 def test_noisy_contacts_of_an_object_that_stands_are_no_pushes():
     """They are off by 3 mm, which pushes of 3 mm explain a bit better: by chance."""
-    contacts, random = known_points(STANDING, 12).known, np.random.default_rng(7)
+    contacts = known_points(STANDING, 12).known
+    random = np.random.default_rng(7)
     contacts = contacts + random.normal(0.0, 0.003, contacts.shape)
     loop = loop_of(moves=0.0125)
     for contact, angle in zip(contacts, random.uniform(-np.pi, np.pi, 12), strict=True):
         direction = [np.cos(angle), np.sin(angle), 0.0]
-        loop.perceive(touch(0, KnownPoints(known=[contact]), direction))
+        loop.perceive(touch(0, KnownPoints(known=[contact]), direction=direction))
     free = KnownPoints(free=known_points(STANDING, 1).free)
     loop.perceive(Probe(step=0, outcome="free", new_points=free))
     found = Anchored(AnchoredSettings(size="small")).register(loop.problem())
@@ -216,16 +224,18 @@ def test_members_of_a_belief_explain_the_points_where_they_are_now():
     poses = inverse(np.stack([truth, STANDING]))
     found = replace(hypotheses_at(poses), push_distance=MOVES)
     found = replace(found, trust=trust_in(problem, found))
-    carried = replace(problem, points=problem.pushes.carried(problem.points, MOVES, SIDE))
+    carried = replace(
+        problem, points=problem.pushes.carried(problem.points, MOVES, resolution=SIDE)
+    )
     for given in (problem, replace(carried, pushes=None)):
         members = PoseBelief(GRID, found, problem=given).object_from_world
         np.testing.assert_array_equal(members, poses[:1])
 
 
 def test_of_free_points_that_meet_in_a_voxel_the_first_stays():
-    pushes = Pushes([X], [[1, 0, 0]], 0.02)
+    pushes = Pushes([X], [[1, 0, 0]], largest=0.02)
     points = KnownPoints(free=[[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.03, 0.0, 0.0]])
-    now = pushes.carried(points, 0.0101, 0.01).free
+    now = pushes.carried(points, 0.0101, resolution=0.01).free
     np.testing.assert_allclose(now, [[0.0101, 0.0, 0.0], [0.03, 0.0, 0.0]])
 
 
@@ -238,7 +248,10 @@ def test_another_problem_is_fitted_elsewhere_by_its_own_points():
     there = replace(here, points=KnownPoints(known=here.points.known + np.array([0.05, 0, 0])))
     far = STANDING.copy()
     far[0, 3] += 0.05
-    best, moved = hypotheses_at(inverse(STANDING[None])), Poses.of(inverse(far[None]))
-    assert fits_elsewhere(here, best, there, moved, 0.0005)
-    assert not fits_elsewhere(here, best, here, moved, 0.0005)
-    assert not fits_elsewhere(here, best, here, Poses.of(best.object_from_world), 0.0005)
+    best = hypotheses_at(inverse(STANDING[None]))
+    moved = Poses.of(inverse(far[None]))
+    assert fits_elsewhere(here, best, other=there, poses=moved, sensor_noise=0.0005)
+    assert not fits_elsewhere(here, best, other=here, poses=moved, sensor_noise=0.0005)
+    assert not fits_elsewhere(
+        here, best, other=here, poses=Poses.of(best.object_from_world), sensor_noise=0.0005
+    )

@@ -83,7 +83,7 @@ def test_a_thin_plate_has_its_distance_in_a_grid_of_few_nodes(monkeypatch):
     points = np.random.default_rng(0).uniform(-0.6 * size, 0.6 * size, (3000, 3))
     distance = grid.at(points, lookup="trilinear")[0]
     np.testing.assert_allclose(distance, box_distance(points, size), atol=grid.resolution / 2.0)
-    on_it = surface_points(grid, 1000, np.random.default_rng(0))
+    on_it = surface_points(grid, 1000, stream=np.random.default_rng(0))
     assert np.abs(box_distance(on_it, size)).max() < grid.resolution / 2.0
 
 
@@ -134,7 +134,7 @@ def test_the_error_at_the_surface_is_that_of_interpolation():
     flat = SdfGrid.from_mesh(BOX, 0.01)  # nodes on its sides, edges and corners
     assert flat.surface_error < 1e-9
     radius, spacing = 0.03, 0.006
-    ball = ball_grid(radius, spacing, 10)
+    ball = ball_grid(radius, spacing, half=10)
     away = np.random.default_rng(0).normal(size=(20_000, 3))
     points = radius * away / np.linalg.norm(away, axis=1, keepdims=True)
     off = ball.at(points, lookup="trilinear")[0]
@@ -176,7 +176,9 @@ def test_nearest_lookup_reads_the_nearest_node(grid):
 def test_trilinear_lookup_is_exact_for_a_linear_field():
     nodes = np.stack(np.meshgrid(*[np.arange(6) * 0.1] * 3, indexing="ij"), -1)
     slope = np.array([0.3, 0.5, 0.2])
-    linear = SdfGrid(np.zeros(3), 0.1, nodes @ slope + 0.01, np.broadcast_to(slope, nodes.shape))
+    linear = SdfGrid(
+        np.zeros(3), 0.1, values=nodes @ slope + 0.01, gradients=np.broadcast_to(slope, nodes.shape)
+    )
     points = np.random.default_rng(2).uniform(0.0, 0.5, (300, 3))
     points[:2] = [[0.5, 0.5, 0.5], [0.0, 0.0, 0.0]]
     sdf, gradient = linear.at(points, lookup="trilinear")
@@ -208,7 +210,7 @@ def test_grids_that_make_no_sense_are_refused(grid):
         (spoiled, grid.gradients, "not finite"),
     ):
         with pytest.raises(SdfError, match=message):
-            SdfGrid(grid.origin, 0.01, values, gradients)
+            SdfGrid(grid.origin, 0.01, values=values, gradients=gradients)
     with pytest.raises(MeshError, match=r"mesh is .*; accepted: a Trimesh with faces"):
         SdfGrid.from_mesh("box.obj")
     with pytest.raises(MeshError, match="mesh is flat; accepted: a solid"):
@@ -232,12 +234,13 @@ def stream():
 def chi_square(counts, shares):
     """How unlike counts are to shares: mean 1 per degree of freedom, here in deviations off it."""
     expected = counts.sum() * shares / shares.sum()
-    total, freedom = (((counts - expected) ** 2) / expected).sum(), len(counts) - 1
+    total = (((counts - expected) ** 2) / expected).sum()
+    freedom = len(counts) - 1
     return float((total - freedom) / np.sqrt(2.0 * freedom))
 
 
 def test_points_are_on_a_sphere_and_uniform_there():
-    points = surface_points(ball_grid(RADIUS, RESOLUTION, 10), COUNT, stream())
+    points = surface_points(ball_grid(RADIUS, RESOLUTION, half=10), COUNT, stream=stream())
     distance = np.sqrt((points**2).sum(axis=1)) - RADIUS
     assert np.abs(distance).max() < 0.02 * RESOLUTION
     # Bands of equal height have equal areas.
@@ -249,7 +252,7 @@ def test_points_are_on_a_sphere_and_uniform_there():
 
 def test_points_are_on_a_box_and_uniform_there():
     grid = SdfGrid.from_mesh(trimesh.creation.box(SIDES), RESOLUTION)
-    points = surface_points(grid, COUNT, stream())
+    points = surface_points(grid, COUNT, stream=stream())
     distance = np.abs(box_distance(points, SIDES))
     assert distance.max() < 0.5 * RESOLUTION  # at corners, which a grid cannot show
     assert distance.mean() < 0.02 * RESOLUTION
@@ -270,12 +273,14 @@ def test_points_are_on_a_box_and_uniform_there():
 def test_a_single_node_inside_has_a_surface(depth):
     values = np.full((4, 4, 4), 0.01)
     values[1, 1, 1] = -depth
-    grid = SdfGrid(np.zeros(3), 0.01, values, np.zeros((4, 4, 4, 3)))
-    points = surface_points(grid, 200, stream())
+    grid = SdfGrid(np.zeros(3), 0.01, values=values, gradients=np.zeros((4, 4, 4, 3)))
+    points = surface_points(grid, 200, stream=stream())
     assert np.abs(points - 0.01).max() < max(2.0 * depth, 1e-12)
 
 
 def test_an_object_between_the_nodes_is_refused():
-    grid = SdfGrid(np.zeros(3), 0.01, np.full((4, 4, 4), 0.01), np.zeros((4, 4, 4, 3)))
+    grid = SdfGrid(
+        np.zeros(3), 0.01, values=np.full((4, 4, 4), 0.01), gradients=np.zeros((4, 4, 4, 3))
+    )
     with pytest.raises(SdfError, match="no node of the SDF grid is inside"):
-        surface_points(grid, 3, stream())
+        surface_points(grid, 3, stream=stream())

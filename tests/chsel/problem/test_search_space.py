@@ -39,7 +39,7 @@ OBLIQUE = SE2Space(
 
 
 def test_nine_numbers_and_transforms_are_inverse_to_each_other():
-    transforms = random_poses(STREAM, 50, 0.3)
+    transforms = random_poses(STREAM, 50, reach=0.3)
     vectors = SE3Space().encode(Poses.of(transforms))
     np.testing.assert_allclose(SE3Space().poses(vectors).matrices, transforms, atol=1e-14)
     vectors[:, 3:6] = 1.7 * vectors[:, 3:6] - 0.4 * vectors[:, 0:3]  # same span, same halves
@@ -123,7 +123,7 @@ def test_turns_are_those_of_scipy_and_positions_on_a_line():
     t = np.array([0.0, 0.1, 0.5, 0.9, 1.0])
     ends = np.tile(compose(first, np.array([1.0, 2.0, 3.0])), (5, 1, 1))
     others = np.tile(compose(second, np.array([2.0, 0.0, 3.0])), (5, 1, 1))
-    between = interpolated(ends, others, t)
+    between = interpolated(ends, others, fraction=t)
     expected = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([first, second])))(t)
     np.testing.assert_allclose(between[:, :3, :3], expected.as_matrix(), atol=1e-12)
     np.testing.assert_allclose(between[:, :3, 3], [[1 + s, 2 - 2 * s, 3] for s in t], atol=1e-15)
@@ -137,9 +137,10 @@ def test_half_of_a_turn_is_half_its_angle(angle):
         compose(axis_angle(axis, part * angle) @ rotation, np.zeros(3))[None]
         for part in (0.0, 0.5, 1.0)
     )
-    found = interpolated(start, turned, np.array([0.5]))
+    found = interpolated(start, turned, fraction=np.array([0.5]))
     if angle == np.pi:  # either way round is as short
-        found, half = interpolated(found, turned, np.array([1.0])), turned
+        found = interpolated(found, turned, fraction=np.array([1.0]))
+        half = turned
     np.testing.assert_allclose(found, half, atol=1e-12)
 
 
@@ -158,9 +159,11 @@ def transforms(count):
 
 def test_descriptors_differ_about_as_much_as_surfaces_do():
     poses = transforms(30)
-    surface = surface_points(GRID, 2000, StreamKey(0, 0).stream(Purpose.METRIC_POINTS))
+    surface = surface_points(GRID, 2000, stream=StreamKey(0, 0).stream(Purpose.METRIC_POINTS))
     settings = DistanceSettings(len(surface), "grid")
-    apart = SurfaceDistance(GRID, None, surface, settings).between(poses, inverse(poses))
+    apart = SurfaceDistance(GRID, None, points=surface, settings=settings).between(
+        poses, inverse(poses)
+    )
     apart = (apart + apart.T) / 2.0
     descriptors = surface_descriptors(GRID, Poses.of(poses))
     squares = ((descriptors[:, None] - descriptors[None]) ** 2).mean(axis=2) * SQUARE_MILLIMETRES
@@ -176,7 +179,7 @@ def test_poses_that_a_symmetry_makes_alike_stand_for_each_other():
     poses = Poses.of(inverse(compose(turns, places)))  # a box looks the same after half a turn
     descriptors = surface_descriptors(GRID, poses)
     np.testing.assert_allclose(descriptors[::2], descriptors[1::2], atol=3e-4)
-    chosen = representative_poses(GRID, poses, 15)
+    chosen = representative_poses(GRID, poses, count=15)
     assert sorted(chosen // 2) == list(range(15))
 
 
@@ -184,7 +187,7 @@ def test_each_choice_is_the_one_that_takes_off_the_most():
     poses = Poses.of(transforms(40))
     points = surface_descriptors(GRID, poses)
     squares = ((points[:, None] - points[None]) ** 2).sum(axis=2)
-    chosen = representative_poses(GRID, poses, 6)
+    chosen = representative_poses(GRID, poses, count=6)
     assert chosen[0] == 0
     for n in range(1, 6):
         nearest = squares[:, chosen[:n]].min(axis=1, keepdims=True)
@@ -194,9 +197,9 @@ def test_each_choice_is_the_one_that_takes_off_the_most():
 
 def test_copies_are_chosen_once():
     poses = Poses.of(np.repeat(transforms(3), 4, axis=0))
-    chosen = representative_poses(GRID, poses, 10)
+    chosen = representative_poses(GRID, poses, count=10)
     assert sorted(chosen // 4) == [0, 1, 2]
-    assert representative_poses(GRID, poses[:1], 5).tolist() == [0]
+    assert representative_poses(GRID, poses[:1], count=5).tolist() == [0]
 
 
 def test_points_far_apart_are_each_the_farthest_from_those_before():

@@ -44,7 +44,7 @@ def test_every_preset_survives_the_way_through_a_mapping(method):
 )
 def test_wrong_settings_name_the_key_and_what_is_accepted(mapping, message):
     with pytest.raises(SettingError, match=message):
-        build_settings(ChselSettings, mapping, "method")
+        build_settings(ChselSettings, mapping, where="method")
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,12 @@ def test_settings_accept_what_their_annotations_and_their_class_accept(values, m
 
 def test_values_at_the_limits_and_none_pass_where_the_type_has_it():
     limits = Checked(count=1_000, length=10.0, limit=5.0)
-    assert build_settings(Checked, settings_mapping(limits), "settings") == limits
-    assert build_settings(Checked, {"limit": None, "rate": 2}, "settings") == Checked(rate=2.0)
+    assert build_settings(Checked, settings_mapping(limits), where="settings") == limits
+    assert build_settings(Checked, {"limit": None, "rate": 2}, where="settings") == Checked(
+        rate=2.0
+    )
     with pytest.raises(SettingError, match=r"^settings.count is None; accepted: an integer$"):
-        build_settings(Checked, {"count": None}, "settings")
+        build_settings(Checked, {"count": None}, where="settings")
 
 
 POLICY = """
@@ -127,7 +129,9 @@ def install(tmp_path, monkeypatch):
         (tmp_path / f"{module}.py").write_text(POLICY)
         monkeypatch.syspath_prepend(str(tmp_path))
         ours = {"grid": (ConfiguredPolicy, PolicySettings())}
-        return NamedChoices("policy", "chsel.policies", "docs/page.md", ours, _lacks)
+        return NamedChoices(
+            "policy", "chsel.policies", page="docs/page.md", ours=ours, lacks=_lacks
+        )
 
     return done
 

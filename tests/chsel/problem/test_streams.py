@@ -16,7 +16,8 @@ def stream(seed=3):
 def test_normals_are_made_of_the_raw_output_two_by_two():
     raw = np.random.Philox(key=(int(Purpose.EMITTER) << 84) | 3).random_raw(2000)
     u, v = ((raw >> np.uint64(11)) * 2.0**-53).reshape(-1, 2).T
-    radius, angle = np.sqrt(-2.0 * np.log1p(-u)), 2.0 * np.pi * v
+    radius = np.sqrt(-2.0 * np.log1p(-u))
+    angle = 2.0 * np.pi * v
     expected = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1).reshape(-1)
     np.testing.assert_allclose(normals(stream(), 2000), expected, rtol=1e-13, atol=1e-15)
 
@@ -35,8 +36,9 @@ def test_fewer_numbers_are_the_first_of_more_and_take_whole_pairs():
 
 
 def test_uniforms_fill_their_box():
-    lower, upper = np.array([-1.0, 0.0, 5.0]), np.array([1.0, 0.5, 5.5])
-    drawn = uniforms(stream(), lower, upper, (100_000, 3))
+    lower = np.array([-1.0, 0.0, 5.0])
+    upper = np.array([1.0, 0.5, 5.5])
+    drawn = uniforms(stream(), lower, upper=upper, shape=(100_000, 3))
     assert (drawn >= lower).all()
     assert (drawn < upper).all()
     for column in ((drawn - lower) / (upper - lower)).T:
@@ -72,7 +74,8 @@ def drawn(stream, first, count):
 
 @pytest.mark.parametrize("first", [0, 3, 8, 1021, 8 * 2**40 + 5])
 def test_kernels_draw_the_numbers_of_a_stream_from_any_place(first):
-    key, count = StreamKey(2**64 - 5, 2**32 - 1), 300
+    key = StreamKey(2**64 - 5, 2**32 - 1)
+    count = 300
     expected = key.stream(Purpose.WALKS, 7)
     expected.bit_generator.advance(first // 8)
     wanted = expected.random(first % 8 + count, dtype=np.float32)[first % 8 :]

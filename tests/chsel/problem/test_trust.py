@@ -26,6 +26,7 @@ from chsel.problem.trust import (
     MOST_OFF,
     MOST_SYSTEMATIC,
     MOST_WIDTH,
+    SENSOR_NOISE,
     _solved,
     check_trust,
     correlation,
@@ -41,11 +42,13 @@ SIDES = np.array([0.1, 0.06, 0.16])
 BOX = trimesh.creation.box(SIDES)
 GRID = chsel.SdfGrid.from_mesh(BOX, 0.004)
 CAN = trimesh.creation.cylinder(0.04, 0.12, sections=64)
-RADIUS, VOXEL, NOISE = 0.1, 0.01, 0.001
+RADIUS = 0.1
+VOXEL = 0.01
+NOISE = 0.001
 NODES = np.moveaxis(np.indices((121, 121, 121)), 0, -1) * 0.005 - 0.3
 FROM_CENTRE = np.linalg.norm(NODES, axis=-1)
 GRADIENTS = NODES / np.maximum(FROM_CENTRE, 1e-9)[..., None]
-BALL = chsel.SdfGrid(np.full(3, -0.3), 0.005, FROM_CENTRE - RADIUS, GRADIENTS)
+BALL = chsel.SdfGrid(np.full(3, -0.3), 0.005, values=FROM_CENTRE - RADIUS, gradients=GRADIENTS)
 NORMALS = trimesh.unitize(np.random.default_rng(0).standard_normal((60, 3)))
 CENTRE = np.array([0.3, 0.2, 0.1])
 POSE = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(0.7)), CENTRE)  # world_from_object
@@ -56,18 +59,25 @@ SIDE = np.array([[0.05, y, z] for y in (-0.02, 0.0, 0.02) for z in (-0.04, 0.0, 
 def problem(sdf=BALL, **points):
     room = chsel.Workspace((-1, -1, -1), (1, 1, 1))
     known = chsel.KnownPoints(**points)
-    return RegistrationProblem(sdf, known, np.eye(4)[None], room, VOXEL, StreamKey(0, 0))
+    return RegistrationProblem(
+        sdf=sdf,
+        points=known,
+        initial_set=np.eye(4)[None],
+        workspace=room,
+        free_resolution=VOXEL,
+        key=StreamKey(0, 0),
+    )
 
 
-def judged(found, *noise_and_rivals, sdf=BALL, **points):
-    return trust_in(problem(sdf, **points), found, *noise_and_rivals)
+def judged(found, noise=SENSOR_NOISE, *, sdf=BALL, **points):
+    return trust_in(problem(sdf, **points), found, sensor_noise=noise)
 
 
 def hypotheses(*world_from_object):
     return hypotheses_at(inverse(np.array(world_from_object)))
 
 
-def moved(x=0.0, y=0.0, z=0.0, about_z=0.0):
+def moved(x=0.0, y=0.0, *, z=0.0, about_z=0.0):
     """POSE after a motion of the object in its own frame, metres and radians."""
     turn = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(about_z))
     return POSE @ compose(turn, np.array([x, y, z]))
@@ -193,7 +203,7 @@ def test_samples_of_a_continuum_are_no_modes(shifts):
 @pytest.fixture
 def held(monkeypatch):
     """No pose can be moved, so that the verdict depends on the poses of the set."""
-    monkeypatch.setattr("chsel.problem.trust.motion_cost", lambda *_: math.inf)
+    monkeypatch.setattr("chsel.problem.trust.motion_cost", lambda *_, **__: math.inf)
 
 
 def lying(z=0.0):
@@ -204,8 +214,10 @@ def lying(z=0.0):
 
 @pytest.mark.usefixtures("held")
 def test_a_set_is_wide_where_any_mode_is():
-    steps, known = np.arange(0.0, 0.041, 0.01), apply(POSE, SIDE)
-    narrow, wide = [POSE, moved(z=0.01)], [moved(z=step) for step in steps]
+    steps = np.arange(0.0, 0.041, 0.01)
+    known = apply(POSE, SIDE)
+    narrow = [POSE, moved(z=0.01)]
+    wide = [moved(z=step) for step in steps]
     others = [lying(), lying(0.01)]
     for poses, verdict in (
         ([*narrow, *others], "several modes"),
@@ -232,7 +244,7 @@ def test_a_set_is_wide_where_any_mode_can_be_moved(monkeypatch, movable):
     one = found.object_from_world[movable]
     monkeypatch.setattr(
         "chsel.problem.trust.motion_cost",
-        lambda _, pose, *__: LIMIT if np.array_equal(pose.matrices[0], one) else math.inf,
+        lambda _, pose, *__, **___: LIMIT if np.array_equal(pose.matrices[0], one) else math.inf,
     )
     assert judged(found, sdf=GRID, known=apply(POSE, SIDE)).verdict == "wide"
 
@@ -242,7 +254,7 @@ def test_a_set_is_wide_where_any_mode_can_be_moved(monkeypatch, movable):
     [(8.7, "wide", "8.7 nats"), (9.4, "determined", "9.4 nats"), (13.6, "determined", None)],
 )
 def test_a_verdict_says_how_near_to_its_limit_it_is(monkeypatch, cost, verdict, said):
-    monkeypatch.setattr("chsel.problem.trust.motion_cost", lambda *_: cost)
+    monkeypatch.setattr("chsel.problem.trust.motion_cost", lambda *_, **__: cost)
     trust = judged(hypotheses(POSE, moved(z=0.002)), sdf=GRID, known=on_box())
     limit = MOST_WIDTH * GRID.diameter
     assert (trust.verdict, trust.limit) == (verdict, limit)
@@ -253,7 +265,8 @@ def test_a_verdict_says_how_near_to_its_limit_it_is(monkeypatch, cost, verdict, 
 
 def test_the_text_has_no_number_that_few_contacts_cannot_show():
     """Before any distance is known, noise and outliers are those of a prior."""
-    points, off = at_height(0.0), CENTRE + 0.5 * RADIUS * NORMALS[:1]
+    points = at_height(0.0)
+    off = CENTRE + 0.5 * RADIUS * NORMALS[:1]
     texts = [
         str(judged(TURNED_BALL, NOISE, known=known))
         for known in (points[:6], points[:8], np.concatenate([points[:8], off]))
@@ -305,21 +318,25 @@ def test_poses_that_leave_out_one_of_few_contacts_are_rivals():
     known = np.array([*side, [0.02, 0.03, -0.03], [0.0, 0.0, 0.08], [-0.02, 0.03, 0.03]])
     assert len(known) == MANY_CONTACTS - 1
     slid = np.array([moved(x=x, z=0.03) for x in np.arange(0.0, 0.005, 0.0001)])
-    rivals, noise = Poses.of(inverse(slid)), noise_model(NOISE)
+    rivals = Poses.of(inverse(slid))
+    noise = noise_model(NOISE)
     for contacts, few in ((known, True), (np.concatenate([known, [[0.05, 0.01, 0.02]]]), False)):
         posed = problem(GRID, known=apply(POSE, contacts))
-        energies = pose_energies(posed, Poses.joined([BEST, rivals]), noise)
+        energies = pose_energies(posed, Poses.joined([BEST, rivals]), noise=noise)
         above = energies[1:] - energies[0]
         n = int(np.argmin(np.abs(above - LIMIT - 0.5 * FOREIGN_CONTACT)))
         assert LIMIT < above[n] < LIMIT + FOREIGN_CONTACT
-        alone, found = hypotheses(POSE), hypotheses(POSE, slid[n])
-        assert trust_in(posed, alone, NOISE).verdict == "determined"
-        assert trust_in(posed, found, NOISE).verdict == "determined"  # it is too unlikely itself
-        beside = trust_in(posed, alone, NOISE, rivals[n : n + 1])
+        alone = hypotheses(POSE)
+        found = hypotheses(POSE, slid[n])
+        assert trust_in(posed, alone, sensor_noise=NOISE).verdict == "determined"
+        assert (
+            trust_in(posed, found, sensor_noise=NOISE).verdict == "determined"
+        )  # it is too unlikely itself
+        beside = trust_in(posed, alone, sensor_noise=NOISE, rivals=rivals[n : n + 1])
         assert beside.verdict == ("several modes" if few else "determined")
         assert beside.best_of_modes == (0,)  # rivals have no index
         apart = Poses.of(inverse(moved(x=0.03)[None]))
-        assert trust_in(posed, alone, NOISE, apart).verdict == "determined"
+        assert trust_in(posed, alone, sensor_noise=NOISE, rivals=apart).verdict == "determined"
 
 
 def test_twins_are_told_apart_and_true_symmetries_are_not():
@@ -329,13 +346,14 @@ def test_twins_are_told_apart_and_true_symmetries_are_not():
     sides = np.array([[x, y, z] for x in (-0.0515, 0.0515) for y, z in corners])
     ends = [[x, y, z] for x in (-0.02, 0.02) for y in (-0.02, 0.02) for z in (-0.08, 0.08)]
     posed = problem(sdf, known=apply(POSE, np.concatenate([sides, sides[:, [1, 0, 2]], ends])))
-    quarter, half = moved(about_z=0.5 * math.pi), moved(about_z=math.pi)
-    alike = trust_in(posed, hypotheses(POSE, half), NOISE)
+    quarter = moved(about_z=0.5 * math.pi)
+    half = moved(about_z=math.pi)
+    alike = trust_in(posed, hypotheses(POSE, half), sensor_noise=NOISE)
     assert (alike.verdict, alike.modes, alike.twins) == ("determined", 1, None)
     quarters = Poses.of(inverse(quarter[None]))
     for trust, best in (
-        (trust_in(posed, hypotheses(POSE, half, quarter), NOISE), (0, 2)),
-        (trust_in(posed, hypotheses(POSE), NOISE, quarters), (0,)),
+        (trust_in(posed, hypotheses(POSE, half, quarter), sensor_noise=NOISE), (0, 2)),
+        (trust_in(posed, hypotheses(POSE), sensor_noise=NOISE, rivals=quarters), (0,)),
     ):
         assert (trust.verdict, trust.modes, trust.best_of_modes) == ("several modes", 2, best)
         expected = 0.5 * math.pi, pytest.approx(0.003 * math.sqrt(0.066 / 0.087), rel=0.15)
@@ -346,7 +364,8 @@ def test_twins_are_told_apart_and_true_symmetries_are_not():
 def test_the_spread_is_the_root_mean_square_of_surfaces_of_all_pairs():
     """Of balls d apart, each point of a surface is d |cos| off the other, d / sqrt(3) on average.
 
-    Three balls in a row have four of nine pairs d apart, and two of them 2 d."""
+    Three balls in a row have four of nine pairs d apart, and two of them 2 d.
+    """
     shift = 0.002
     row = [compose(np.eye(3), moved(x=n * shift)[:3, 3]) for n in range(3)]
     trust = judged(hypotheses(*row), 0.01, known=at_height(0.0))
@@ -379,7 +398,7 @@ def test_poses_that_are_not_finite_or_repeated_are_left_out():
         with pytest.raises(PoseError, match="accepted: at least one pose"):
             trust_in(posed, bad)
     with pytest.raises(SettingError, match=r"sensor_noise is 0\.0"):
-        trust_in(posed, TURNED_BALL, 0.0)
+        trust_in(posed, TURNED_BALL, sensor_noise=0.0)
 
 
 def test_an_object_thinner_than_its_grid_is_judged_too():
@@ -397,7 +416,7 @@ def movable(mesh, noise=NOISE, **points):
     """Whether the mesh at POSE can be moved by 6 mm; points in the object's frame."""
     sdf = chsel.SdfGrid.from_mesh(mesh, 0.004)
     known = {name: apply(POSE, group) for name, group in points.items()}
-    return motion_cost(problem(sdf, **known), BEST, noise, 0.006) <= LIMIT
+    return motion_cost(problem(sdf, **known), BEST, sensor_noise=noise, distance=0.006) <= LIMIT
 
 
 def on(mesh, count):
@@ -436,13 +455,14 @@ def test_energies_of_poses_are_the_plain_formula(contacts):
     turns = axis_angle(np.array([0.0, 0.6, 0.8]), np.array([0.0, 0.05, 0.5]))
     poses = Poses.of(inverse(POSE @ compose(turns, random.normal(0.0, 0.01, (3, 3)))))
     noise = noise_model(NOISE)
-    expected = plain_energies(noise, posed.sdf, posed.points, poses)
-    np.testing.assert_allclose(pose_energies(posed, poses, noise), expected, rtol=1e-9)
+    expected = plain_energies(noise, posed.sdf, points=posed.points, poses=poses)
+    np.testing.assert_allclose(pose_energies(posed, poses, noise=noise), expected, rtol=1e-9)
 
 
 def test_the_correlation_is_of_errors_with_those_of_the_three_nearest():
     random = np.random.default_rng(2)
-    points, errors = random.uniform(-1.0, 1.0, (20, 3)) * (1.0, 2.0, 3.0), random.normal(size=20)
+    points = random.uniform(-1.0, 1.0, (20, 3)) * (1.0, 2.0, 3.0)
+    errors = random.normal(size=20)
     near = np.linalg.norm(points[:, None] - points, axis=-1).argsort(axis=1)[:, 1:4]
     expected = (errors[:, None] * errors[near]).sum() / (3.0 * (errors**2).sum())
     assert correlation(points, errors) == pytest.approx(expected)
@@ -459,7 +479,7 @@ def test_a_box_beside_its_origin_is_as_symmetric():
     sdf = chsel.SdfGrid.from_mesh(BOX.copy().apply_translation((0.05, -0.03, 0.02)), 0.004)
     turns = axis_angle(np.array([0.0, 0.0, 1.0]), np.array([0.0, math.pi, 0.5 * math.pi]))
     poses = Poses.of(compose(turns, np.array([CENTRE, -CENTRE, CENTRE])))
-    quarter = turned(sdf, poses, np.ones((3, 3), dtype=bool))
+    quarter = turned(sdf, poses, pairs=np.ones((3, 3), dtype=bool))
     assert quarter.tolist() == [[False, False, True], [False, False, True], [True, True, False]]
 
 
@@ -499,17 +519,21 @@ def test_one_contact_far_off_among_five_is_an_outlier():
 @pytest.mark.parametrize(("known", "shared"), [(0, 0.0), (3, 0.0), (12, 0.004), (50, 0.0)])
 def test_energies_are_the_formula(known, shared):
     """Of contacts, one of which is 30 cm off, and of 40 voxels: none, some or most are wrong."""
-    random, noise = np.random.default_rng(known), noise_model(SENSOR, shared)
+    random = np.random.default_rng(known)
+    noise = noise_model(SENSOR, shared)
     residuals = random.normal(0.0, 0.004, (9, known))
     residuals[4:, :1] = 0.3
     depths = random.normal(np.repeat([-0.03, -0.003, 0.01], 3)[:, None], 0.004, (9, 40))
-    expected = [plain_energy(noise, *row) for row in zip(residuals, depths, strict=True)]
+    expected = [
+        plain_energy(noise, row[0], depths=row[1]) for row in zip(residuals, depths, strict=True)
+    ]
     np.testing.assert_allclose(noise.energies(residuals, depths), expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("sensor", [0.0, 0.003])
 def test_levels_of_noise_are_those_of_the_sensor_and_of_all_else(sensor):
-    noise, errors = noise_model(sensor), np.geomspace(0.0006, 0.008, 8)
+    noise = noise_model(sensor)
+    errors = np.geomspace(0.0006, 0.008, 8)
     weights = np.exp(-0.5 * (np.log(errors / 0.002) / 0.6) ** 2)
     np.testing.assert_allclose(noise.sigmas, np.sqrt(sensor**2 + errors**2))
     np.testing.assert_allclose(noise.weights, weights / weights.sum())

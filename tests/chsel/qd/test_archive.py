@@ -25,15 +25,15 @@ def sampled(objectives, uniform):
 
 @pytest.fixture
 def archive():
-    return GridArchive(XY, np.array([0.0, -1.0]), np.array([1.0, 1.0]), bins=4, dimension=2)
+    return GridArchive(XY, np.array([0.0, -1.0]), upper=np.array([1.0, 1.0]), bins=4, dimension=2)
 
 
 def cells_of(archive, measures):
-    return archive.add(measures, np.zeros(len(measures)), measures).cells
+    return archive.add(measures, np.zeros(len(measures)), measures=measures).cells
 
 
-def add(archive, measures, objectives):
-    archive.add(np.array(measures), np.array(objectives), np.array(measures))
+def add(archive, measures, *, objectives):
+    archive.add(np.array(measures), np.array(objectives), measures=np.array(measures))
 
 
 def test_cells_are_row_major_with_the_last_measure_fastest(archive):
@@ -42,7 +42,7 @@ def test_cells_are_row_major_with_the_last_measure_fastest(archive):
 
 
 def test_elites_are_sampled_from_occupied_cells_alone(archive):
-    add(archive, [[0.1, -0.9], [0.9, 0.9], [0.3, 0.1]], [-1.0, -2.0, -3.0])
+    add(archive, [[0.1, -0.9], [0.9, 0.9], [0.3, 0.1]], objectives=[-1.0, -2.0, -3.0])
     uniform = np.linspace(0.0, 1.0, 300, endpoint=False)
     drawn = np.array([sampled(archive.cells.objectives, u) for u in uniform])
     found, counts = np.unique(drawn, return_counts=True)
@@ -59,14 +59,17 @@ def test_an_empty_archive_has_no_elite_to_sample(archive):
 def test_a_solution_that_is_not_finite_never_enters(archive):
     measures = np.array([[0.1, -0.9], [0.9, 0.9]])
     solutions = np.array([[0.1, -0.9], [0.9, np.nan]])
-    assert archive.add(solutions, np.array([-1.0, -2.0]), measures).cells.tolist() == [0, -1]
+    assert archive.add(solutions, np.array([-1.0, -2.0]), measures=measures).cells.tolist() == [
+        0,
+        -1,
+    ]
     np.testing.assert_array_equal(archive.occupied, [0])
 
 
 def test_snapshot_is_a_copy_with_its_statistics(archive):
-    add(archive, [[0.1, -0.9], [0.9, 0.9]], [-1.0, -2.0])
+    add(archive, [[0.1, -0.9], [0.9, 0.9]], objectives=[-1.0, -2.0])
     snapshot = archive.snapshot(iteration=7, refinement=1)
-    add(archive, [[0.1, -0.9], [0.3, 0.1]], [-0.5, -2.0])
+    add(archive, [[0.1, -0.9], [0.3, 0.1]], objectives=[-0.5, -2.0])
     np.testing.assert_array_equal(snapshot.objectives, [-1.0, -2.0])
     assert snapshot.coverage == 2 / 16
     assert snapshot.qd_score == pytest.approx((99.0 + 98.0) / 16)
@@ -79,13 +82,15 @@ def test_angles_across_half_a_turn_stay_neighbours():
     mean, deviation = angle.moments(values)
     assert abs(abs(mean[0]) - np.pi) < 1e-12
     assert deviation[0] == pytest.approx(np.sqrt((0.02**2 + 0.01**2) / 2), rel=1e-3)
-    archive = GridArchive(angle, mean - 0.04, mean + 0.04, bins=8, dimension=1)
+    archive = GridArchive(angle, mean - 0.04, upper=mean + 0.04, bins=8, dimension=1)
     order = np.argsort([-0.02, 0.02, -0.01, 0.01])
     cells = cells_of(archive, values)[order]
     np.testing.assert_array_equal(cells, [2, 3, 5, 6])
 
 
-BINS, LOWER, UPPER = 4, -1.0, 1.0
+BINS = 4
+LOWER = -1.0
+UPPER = 1.0
 
 
 class PlainArchive:
@@ -134,15 +139,15 @@ SOLUTIONS = st.tuples(
 @given(st.booleans(), st.lists(st.lists(SOLUTIONS, min_size=1, max_size=9), max_size=4))
 @example(True, [[((math.pi + 0.1, 3.0 * math.pi), -1.0), ((0.1 - math.pi, -math.pi), 0.0)]])
 def test_insertion_is_that_of_a_plain_loop(circular, batches):
-    measure = Measure(("x", "y"), MeasureCode(VECTOR, 2), circular)
+    measure = Measure(("x", "y"), MeasureCode(VECTOR, 2), circular=circular)
     lower, upper = np.full(2, LOWER), np.full(2, UPPER)
-    archive = GridArchive(measure, lower, upper, bins=BINS, dimension=3)
+    archive = GridArchive(measure, lower, upper=upper, bins=BINS, dimension=3)
     plain = PlainArchive(circular)
     for batch in batches:
         measures = np.array([solution[0] for solution in batch])
         objectives = np.array([solution[1] for solution in batch])
         serial = np.arange(len(batch))[:, None]  # tells equal solutions apart
-        offers = archive.add(np.hstack([serial, measures]), objectives, measures)
+        offers = archive.add(np.hstack([serial, measures]), objectives, measures=measures)
         found = zip(offers.status.tolist(), offers.value.tolist(), strict=True)
         assert list(found) == plain.add(batch)
     assert archive.occupied.tolist() == sorted(plain.best)
@@ -175,7 +180,7 @@ def test_ranking_is_by_status_then_value_then_the_later(pairs):
     assert improved == (status > 0).sum()
 
 
-TILTED = SE2Space(PlaneSettings(axis=(0.0, 0.6, 0.8), offset=0.1), ball_grid(0.05, 0.02, 5))
+TILTED = SE2Space(PlaneSettings(axis=(0.0, 0.6, 0.8), offset=0.1), ball_grid(0.05, 0.02, half=5))
 ON_PLANES = [name for name in MEASURES if name.startswith("plane")]
 CASES = [(name, TILTED if name in ON_PLANES else SE3Space()) for name in sorted(MEASURES)]
 CASES += [(name, TILTED) for name in ("position_3", "object_xy", "object_yaw")]
@@ -208,8 +213,9 @@ def test_measures_of_vectors_and_translations_are_their_entries():
 
 
 def test_object_measures_are_of_world_from_object():
-    transforms = random_poses(np.random.default_rng(3), 10, 0.3)
-    world, vectors = inverse(transforms), SE3Space().encode(Poses.of(transforms))
+    transforms = random_poses(np.random.default_rng(3), 10, reach=0.3)
+    world = inverse(transforms)
+    vectors = SE3Space().encode(Poses.of(transforms))
     xy, yaw = (MEASURES[name].values(SE3Space(), vectors) for name in ("object_xy", "object_yaw"))
     np.testing.assert_allclose(xy, world[:, :2, 3], atol=1e-14)
     np.testing.assert_allclose(yaw[:, 0], np.arctan2(world[:, 1, 0], world[:, 0, 0]), atol=1e-12)
@@ -219,7 +225,8 @@ def test_an_object_that_points_straight_up_has_a_yaw_and_no_gradient_of_it():
     """The object's x axis along the world's z: the heading is not defined."""
     rotation = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     vector = SE3Space().encode(Poses.of(compose(rotation[None], np.zeros((1, 3)))))
-    space, yaw = SE3Space(), MEASURES["object_yaw"]
+    space = SE3Space()
+    yaw = MEASURES["object_yaw"]
     assert np.isfinite(yaw.values(space, vector)).all()
     np.testing.assert_array_equal(yaw.gradients(space, vector[0]), np.zeros((1, 9)))
 

@@ -43,7 +43,8 @@ class LandscapeObjective:
     """What the searches ask for in place of chsel.cost.objective.Objective."""
 
     def __init__(self, kind):
-        self.model, self.space_arrays = Landscape(kind), PLANAR
+        self.model = Landscape(kind)
+        self.space_arrays = PLANAR
 
     def work(self):
         return 0
@@ -76,15 +77,24 @@ def searches_of_a_landscape(searches_around):
 
 
 def empty_archive():
-    return GridArchive(MEASURE, np.full(2, -0.5), np.full(2, 0.5), bins=8, dimension=4)
+    return GridArchive(MEASURE, np.full(2, -0.5), upper=np.full(2, 0.5), bins=8, dimension=4)
 
 
-def found(name, kind, interval=0):
+def found(name, kind, *, interval=0):
     """The archive after a search."""
     archive = empty_archive()
     objective: Any = LandscapeObjective(kind)
     observer = Watcher(snapshot_interval=interval)
-    fill_archive(name, objective, archive, START, COUNT, SETTINGS, StreamKey(4, 0), observer)
+    fill_archive(
+        name,
+        objective,
+        archive=archive,
+        start=START,
+        count=COUNT,
+        settings=SETTINGS,
+        key=StreamKey(4, 0),
+        observer=observer,
+    )
     shown = [*range(0, ITERATIONS, interval or ITERATIONS), ITERATIONS]
     assert [snapshot.iteration for snapshot in observer.archives] == shown
     return archive
@@ -94,22 +104,31 @@ class Stepper:
     """One search, iteration by iteration, on one landscape after another."""
 
     def __init__(self, name):
-        self.archive, self.iteration = empty_archive(), 0
+        self.archive = empty_archive()
+        self.iteration = 0
         self.search: Any = (
-            mega_search(START, 2, COUNT, SETTINGS)
+            mega_search(START, 2, batch=COUNT, settings=SETTINGS)
             if name == "cma_mega"
-            else me_search(START, 2, COUNT, SETTINGS)
+            else me_search(START, 2, batch=COUNT, settings=SETTINGS)
         )
         loops = {"cma_mega": emitters.mega_iterations, "cma_me": emitters.me_iterations}
         self._loop = loops[name]
-        random, n = np.random.default_rng(0), len(self.search.strategy.mean)
+        random = np.random.default_rng(0)
+        n = len(self.search.strategy.mean)
         self._normals = random.standard_normal((ITERATIONS, COUNT, n))
         self.elites = random.random(ITERATIONS)
 
     def step(self, kind):
-        landscape = emitters.Landscape(Landscape(kind), PLANAR, MEASURE.code, 0)
-        random, span = (self._normals, self.elites), (self.iteration, self.iteration + 1)
-        self._loop(landscape, self.archive.cells, self.search, *random, *span)
+        landscape = emitters.Landscape(Landscape(kind), PLANAR, measure=MEASURE.code, work=0)
+        self._loop(
+            landscape,
+            self.archive.cells,
+            search=self.search,
+            normals=self._normals,
+            elites=self.elites,
+            first=self.iteration,
+            last=self.iteration + 1,
+        )
         self.iteration += 1
 
 
@@ -130,13 +149,16 @@ def test_a_search_fills_the_archive_and_finds_the_optimum(name):
     np.testing.assert_array_equal(archive.costs, Landscape(QUADRATIC).costs(archive.solutions))
     measures = archive.cells.measures[archive.occupied]
     np.testing.assert_array_equal(measures, archive.solutions[:, :2])
-    offers = archive.add(archive.solutions, -archive.costs, measures)
+    offers = archive.add(archive.solutions, -archive.costs, measures=measures)
     np.testing.assert_array_equal(offers.cells, archive.occupied)
 
 
 @pytest.mark.parametrize("name", SEARCHES)
 def test_iterations_between_calls_change_no_byte(name):
-    assert len({bytes_of(found(name, QUADRATIC, interval)) for interval in (0, 1, 7, 25)}) == 1
+    assert (
+        len({bytes_of(found(name, QUADRATIC, interval=interval)) for interval in (0, 1, 7, 25)})
+        == 1
+    )
 
 
 @pytest.mark.parametrize("name", SEARCHES)

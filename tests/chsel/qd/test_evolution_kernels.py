@@ -11,10 +11,14 @@ from chsel.qd.evolution_kernels import strategy_around
 class MatrixStrategy:
     """Hansen's tutorial with positive weights of any number of parents."""
 
-    def __init__(self, mean, batch, sigma, parity):
+    def __init__(self, mean, batch, *, sigma, parity):
         n = len(mean)
-        self.n, self.batch, self.parity = n, batch, parity
-        self.mean, self.sigma, self.covariance = mean, sigma, np.eye(n)
+        self.n = n
+        self.batch = batch
+        self.parity = parity
+        self.mean = mean
+        self.sigma = sigma
+        self.covariance = np.eye(n)
         self.path_c, self.path_s = np.zeros(n), np.zeros(n)
         self.values, self.vectors = np.ones(n), np.eye(n)
         self.told = self.decomposed_at = 0
@@ -36,7 +40,8 @@ class MatrixStrategy:
     def ask(self, normals, vectors):
         """Samples; `vectors` settle signs, and the basis where eigenvalues are equal."""
         if self.told > self.decomposed_at + self.gap:
-            self.values, self.vectors = np.linalg.eigvalsh(self.covariance), vectors.copy()
+            self.values = np.linalg.eigvalsh(self.covariance)
+            self.vectors = vectors.copy()
             self.decomposed_at = self.told
             np.testing.assert_allclose(vectors.T @ vectors, np.eye(self.n), atol=1e-13)
             back = vectors @ np.diag(self.values) @ vectors.T
@@ -93,10 +98,12 @@ def stopped(strategy, order, status, value):
 @pytest.mark.parametrize(("n", "batch"), [(2, 29), (3, 29), (9, 30), (7, 5), (4, 1)])
 def test_samples_are_those_of_cma_es_with_matrices(n, batch, parity):
     random = np.random.default_rng(n)
-    mean, samples = random.standard_normal(n), np.zeros((batch, n))
-    ours = strategy_around(mean, batch, 0.7, ribs_parity=parity)
-    theirs = MatrixStrategy(mean, batch, 0.7, parity)
-    centre, weights = random.standard_normal(n), 1.0 + np.arange(n)
+    mean = random.standard_normal(n)
+    samples = np.zeros((batch, n))
+    ours = strategy_around(mean, batch, sigma0=0.7, ribs_parity=parity)
+    theirs = MatrixStrategy(mean, batch, sigma=0.7, parity=parity)
+    centre = random.standard_normal(n)
+    weights = 1.0 + np.arange(n)
     steady = 0
     for iteration in range(25):
         normals = random.standard_normal((batch, n))
@@ -120,7 +127,7 @@ def test_samples_are_those_of_cma_es_with_matrices(n, batch, parity):
 def test_path_c_waits_while_path_s_is_too_long(told, share, steady):
     # For n = 3, one parent, sigma = 1, c_s = 1 / 3: |p_s|^2 / n = |y|^2 5 / 27, and steady where
     # it is below 3 (1 - (1 - c_s)^(2 t)), t batches told.
-    strategy = strategy_around(np.zeros(3), 5, 1.0)
+    strategy = strategy_around(np.zeros(3), 5, sigma0=1.0)
     strategy.evaluations[0] = 5 * told
     samples = np.zeros((5, 3))
     samples[2, 1] = np.sqrt(share * 16.2 * (1.0 - (2.0 / 3.0) ** (2 * told + 2)))
@@ -130,7 +137,7 @@ def test_path_c_waits_while_path_s_is_too_long(told, share, steady):
 
 def strategy_and_ranking(batch):
     order = np.arange(batch)
-    return strategy_around(np.zeros(3), batch, 0.5), order, np.ones_like(order), -1.0 * order
+    return strategy_around(np.zeros(3), batch, sigma0=0.5), order, np.ones_like(order), -1.0 * order
 
 
 def test_it_stops_at_a_degenerate_covariance_a_tiny_step_or_a_flat_ranking():
@@ -155,7 +162,8 @@ def test_it_stops_at_a_degenerate_covariance_a_tiny_step_or_a_flat_ranking():
 
 def test_a_reset_strategy_is_a_new_one_around_its_mean():
     random = np.random.default_rng(5)
-    strategy, new = strategy_and_ranking(6)[0], strategy_around(np.ones(3), 6, 0.5)
+    strategy = strategy_and_ranking(6)[0]
+    new = strategy_around(np.ones(3), 6, sigma0=0.5)
     samples = np.zeros((6, 3))
     for _ in range(5):
         ask(strategy, random.standard_normal((6, 3)), samples)

@@ -20,7 +20,8 @@ ribs_archives = pytest.importorskip("ribs.archives", reason="pyribs is a test de
 ribs_emitters = pytest.importorskip("ribs.emitters", reason="pyribs is a test dependency")
 
 BINS = 40
-LOWER, UPPER = np.array([-0.5, -0.5]), np.array([0.5, 0.5])
+LOWER = np.array([-0.5, -0.5])
+UPPER = np.array([0.5, 0.5])
 BATCH = 29
 ITERATIONS = 100
 
@@ -69,19 +70,28 @@ def searches_of_the_quadratic(searches_around):
     searches_around(cost_of, cost_and_gradient_of)
 
 
-MEASURE = Measure(("x", "y"), MeasureCode(VECTOR, 2, 6))
+MEASURE = Measure(("x", "y"), MeasureCode(VECTOR, 2, first=6))
 START = np.linspace(0.4, -0.2, 9)
 
 
 def search(name, seed, **settings):
     """Our search on the quadratic."""
-    archive = GridArchive(MEASURE, LOWER, UPPER, bins=BINS, dimension=9)
+    archive = GridArchive(MEASURE, LOWER, upper=UPPER, bins=BINS, dimension=9)
     quadratic: Any = Quadratic()
-    archive.add(START[None], -quadratic.costs(START[None]), START[None, 6:8])
+    archive.add(START[None], -quadratic.costs(START[None]), measures=START[None, 6:8])
     count = BATCH + 1 if name == "cma_mega" else BATCH
     options = EmitterSettings(ITERATIONS, **{"sigma0": 1.0, "rate": 0.05, **settings})
     key = StreamKey(seed, 0)
-    fill_archive(name, quadratic, archive, START, count, options, key, NullObserver())
+    fill_archive(
+        name,
+        quadratic,
+        archive=archive,
+        start=START,
+        count=count,
+        settings=options,
+        key=key,
+        observer=NullObserver(),
+    )
     return archive
 
 
@@ -112,7 +122,7 @@ def ribs_archive():
     )
 
 
-def ribs_emitter(name, archive, seed, sigma0):
+def ribs_emitter(name, archive, *, seed, sigma0):
     common = {
         "x0": START,
         "sigma0": sigma0,
@@ -128,11 +138,11 @@ def ribs_emitter(name, archive, seed, sigma0):
     return ribs_emitters.GradientArborescenceEmitter(archive, lr=0.05, **adam, **common)
 
 
-def ribs_search(name, seed, sigma0):
+def ribs_search(name, seed, *, sigma0):
     """The same search by pyribs with our random numbers."""
     quadratic: Any = Quadratic()
     archive = ribs_archive()
-    emitter = ribs_emitter(name, archive, seed, sigma0)
+    emitter = ribs_emitter(name, archive, seed=seed, sigma0=sigma0)
     dimension = 9 if name == "cma_me" else 3
     key = StreamKey(seed, 0)
     drawn = normals(key.stream(Purpose.EMITTER), (ITERATIONS, BATCH, dimension))
@@ -146,17 +156,17 @@ def ribs_search(name, seed, sigma0):
         return {"solution": data["solution"][chosen][None]}
 
     archive.sample_elites = our_elite
-    archive.add(START[None], -quadratic.costs(START[None]), START[None, 6:8])
+    archive.add(START[None], -quadratic.costs(START[None]), measures=START[None, 6:8])
     for iteration in range(ITERATIONS):  # noqa: B007  read by our_elite
         if name == "cma_mega":
             theta = emitter.ask_dqd()
             cost, gradient = quadratic.costs_and_gradients(theta)
-            info = archive.add(theta, -cost, theta[:, 6:8])
+            info = archive.add(theta, -cost, measures=theta[:, 6:8])
             jacobian = np.concatenate([-gradient, np.eye(9)[6:8]])[None]
             emitter.tell_dqd(theta, -cost, theta[:, 6:8], jacobian, info)
         solutions = emitter.ask()
         objective = -quadratic.costs(solutions)
-        info = archive.add(solutions, objective, solutions[:, 6:8])
+        info = archive.add(solutions, objective, measures=solutions[:, 6:8])
         emitter.tell(solutions, objective, solutions[:, 6:8], info)
     return archive
 
@@ -170,7 +180,7 @@ def test_with_its_formulas_and_shared_random_numbers_the_archive_is_that_of_pyri
     # pyribs adds Adam's epsilon before the bias correction; without it the two are one formula.
     monkeypatch.setattr(chsel.qd.emitters, "mega_search", partial(mega_search, epsilon=0.0))
     ours = search(name, 3, sigma0=sigma0, ribs_parity=True)
-    data = ribs_search(name, 3, sigma0).data(return_type="dict")
+    data = ribs_search(name, 3, sigma0=sigma0).data(return_type="dict")
     order = np.argsort(data["index"])
     np.testing.assert_array_equal(ours.occupied, data["index"][order])
     np.testing.assert_allclose(-ours.costs, data["objective"][order], rtol=1e-7)

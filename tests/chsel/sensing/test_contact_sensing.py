@@ -20,7 +20,7 @@ from chsel.sensing.contact_sensing import (
 )
 from chsel.sensing.depth_camera import PinholeCamera
 
-CAMERA = PinholeCamera(224, 171, 200.0, 200.0, 112.0, 85.0)
+CAMERA = PinholeCamera(224, 171, fx=200.0, fy=200.0, cx=112.0, cy=85.0)
 MEMBRANE, RADIUS, PRESSED = 0.10, 0.03, 0.008  # m: its depth; of a sphere; how deep it is pressed
 CENTRE = np.array([0.006, -0.004, MEMBRANE + RADIUS - PRESSED])
 
@@ -80,20 +80,24 @@ def test_pixels_that_do_not_count_are_not_in_the_quantile_or_in_contact():
 
 def test_subsets_are_ascending_seeded_and_all_alike():
     chosen, again = (
-        contact_subset(200, 50, StreamKey(3, 1).stream(Purpose.CONTACT_POINTS)) for _ in range(2)
+        contact_subset(200, 50, stream=StreamKey(3, 1).stream(Purpose.CONTACT_POINTS))
+        for _ in range(2)
     )
     assert len(chosen) == 50
     assert (np.diff(chosen) > 0).all()
     np.testing.assert_array_equal(chosen, again)
     stream = np.random.default_rng(0)
-    counts = sum(np.bincount(contact_subset(10, 3, stream), minlength=10) for _ in range(2000))
+    counts = sum(
+        np.bincount(contact_subset(10, 3, stream=stream), minlength=10) for _ in range(2000)
+    )
     assert np.abs(counts / 2000 - 0.3).max() < 0.05
-    np.testing.assert_array_equal(contact_subset(4, 50, stream), np.arange(4))
+    np.testing.assert_array_equal(contact_subset(4, 50, stream=stream), np.arange(4))
 
 
 @given(st.lists(st.integers(0, 1000), max_size=5), st.integers(0, 200))
 def test_shares_are_in_proportion_and_sum_up(counts, most):
-    shares, total = share(counts, most), sum(counts)
+    shares = share(counts, most)
+    total = sum(counts)
     assert sum(shares) == min(most, total)
     for count, part in zip(counts, shares, strict=True):
         assert 0 <= part <= count
@@ -117,7 +121,7 @@ def test_a_contact_is_found_from_its_force_and_torque(seed):
     force = 7.0 * (-normal + 0.5 * stream.normal(size=3) / 3**0.5)  # inclined
     shift = stream.normal(size=3)  # the origin is not the centre
     torque = np.cross(point + shift, force)
-    found = contact_on_axis(force, torque, np.asarray(SPHERE.triangles) + shift)
+    found = contact_on_axis(force, torque, triangles=np.asarray(SPHERE.triangles) + shift)
     np.testing.assert_allclose(found.point, point + shift, atol=1e-9)
     np.testing.assert_allclose(found.normal, normal, atol=1e-9)
     assert found.miss == 0.0
@@ -126,13 +130,14 @@ def test_a_contact_is_found_from_its_force_and_torque(seed):
 def test_of_overlapping_bodies_the_outer_surface_is_met():
     both = np.concatenate([BOX, BOX + np.array([0.01, 0.0, 0.0])])
     for force, x in (([3.0, 0, 0], -0.02), ([-3.0, 0, 0], 0.03)):
-        found = contact_on_axis(np.array(force), np.zeros(3), both)
+        found = contact_on_axis(np.array(force), np.zeros(3), triangles=both)
         np.testing.assert_allclose(found.point, [x, 0.0, 0.0], atol=1e-12)
 
 
 def test_a_line_that_misses_gives_the_nearest_point_of_an_edge():
-    force, point = np.array([-5.0, 0.0, 0.0]), np.array([0.3, 0.034, 0.01])
-    found = contact_on_axis(force, np.cross(point, force), BOX)
+    force = np.array([-5.0, 0.0, 0.0])
+    point = np.array([0.3, 0.034, 0.01])
+    found = contact_on_axis(force, np.cross(point, force), triangles=BOX)
     assert found.miss == pytest.approx(0.004)
     np.testing.assert_allclose(found.point[1:], [0.03, 0.01], atol=1e-12)
     assert abs(found.point[0]) == pytest.approx(0.02)
@@ -150,6 +155,6 @@ def test_without_torque_the_foremost_part_against_the_force_is_touched():
 def test_forces_along_edges_and_through_corners_have_an_answer():
     for point in ([0.02, 0.03, 0.0], [0.02, 0.03, 0.05], [0.02, 0.0, 0.05]):
         for force in ([-1.0, 0, 0], [0, 0, -1.0], [-1.0, -1.0, -1.0]):
-            found = contact_on_axis(np.array(force), np.cross(point, force), BOX)
+            found = contact_on_axis(np.array(force), np.cross(point, force), triangles=BOX)
             assert found.miss < 1e-9
             assert np.isfinite(found.normal).all()

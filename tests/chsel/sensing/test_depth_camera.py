@@ -14,7 +14,7 @@ from chsel.sensing.depth_camera import (
     valid_pixels,
 )
 
-CAMERA = PinholeCamera(4, 3, 2.0, 4.0, 1.0, 1.5)
+CAMERA = PinholeCamera(4, 3, fx=2.0, fy=4.0, cx=1.0, cy=1.5)
 
 
 def test_points_project_back_onto_their_pixels():
@@ -50,7 +50,7 @@ def test_edges_are_both_sides_of_every_jump_between_valid_neighbours():
     depth = np.where(stream.random((12, 15)) < 0.1, 1.0, 0.5) + stream.uniform(0.0, 0.02, (12, 15))
     depth[stream.random(depth.shape) < 0.2] = np.nan
     valid = np.isfinite(depth) & (stream.random(depth.shape) < 0.9)
-    edges = occlusion_edges(depth, valid, 0.05)
+    edges = occlusion_edges(depth, valid, jump=0.05)
     assert 0 < edges.sum() < valid.sum()
     for row, column in np.ndindex(depth.shape):
         around = np.s_[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
@@ -64,16 +64,16 @@ def test_a_longer_reach_looks_across_a_gap():
     depth[:, 5:] = 1.0
     valid = np.ones(depth.shape, dtype=bool)
     valid[:, 4] = False
-    assert not occlusion_edges(depth, valid, 0.05).any()
-    across = occlusion_edges(depth, valid, 0.05, reach=2)
+    assert not occlusion_edges(depth, valid, jump=0.05).any()
+    across = occlusion_edges(depth, valid, jump=0.05, reach=2)
     np.testing.assert_array_equal(np.flatnonzero(across.any(axis=0)), [3, 5])
 
 
-TELE = PinholeCamera(60, 40, 600.0, 600.0, 29.5, 19.5)
+TELE = PinholeCamera(60, 40, fx=600.0, fy=600.0, cx=29.5, cy=19.5)
 
 
-def regions(depth, jump=0.01, camera=TELE):
-    return depth_regions(depth, depth > 0.0, camera, jump)
+def regions(depth, jump=0.01, *, camera=TELE):
+    return depth_regions(depth, depth > 0.0, camera=camera, jump=jump)
 
 
 def test_regions_end_where_depth_jumps_and_the_threshold_grows_with_depth():
@@ -86,7 +86,12 @@ def test_regions_end_where_depth_jumps_and_the_threshold_grows_with_depth():
     depth[:, 30:] += 0.045  # 1.5 % at 3 m
     assert regions(depth).max() == 1
     assert regions(depth, jump=0.005).max() == 2
-    assert regions(depth, jump=0.005, camera=PinholeCamera(60, 40, 300, 300, 29.5, 19.5)).max() == 1
+    assert (
+        regions(
+            depth, jump=0.005, camera=PinholeCamera(60, 40, fx=300, fy=300, cx=29.5, cy=19.5)
+        ).max()
+        == 1
+    )
 
 
 def test_a_steeply_inclined_surface_is_one_region():
@@ -99,37 +104,37 @@ def test_a_steeply_inclined_surface_is_one_region():
 def test_pixels_that_do_not_count_are_in_no_region_and_connect_none():
     depth = np.full((40, 60), 0.6)
     depth[20], depth[5, 5] = 0.0, np.nan
-    found = depth_regions(depth, np.isfinite(depth) & (depth > 0.0), TELE, 0.01)
+    found = depth_regions(depth, np.isfinite(depth) & (depth > 0.0), camera=TELE, jump=0.01)
     assert found[5, 5] == 0
     assert (found[20] == 0).all()
     assert (found[19, 0], found[21, 0], found.max()) == (1, 2, 2)
     depth[20, 7] = 0.6  # a bridge
     assert regions(np.nan_to_num(depth)).max() == 1
     diagonal = np.eye(3) * 0.5
-    assert regions(diagonal, camera=PinholeCamera(3, 3, 9.0, 9.0, 1.0, 1.0)).max() == 3
+    assert regions(diagonal, camera=PinholeCamera(3, 3, fx=9.0, fy=9.0, cx=1.0, cy=1.0)).max() == 3
 
 
 @pytest.mark.parametrize("side", [1, 9])
 def test_rays_of_small_regions_end_at_the_least_depth_around(side):
     depth = np.full((40, 60), 0.6)
     depth[10 : 10 + side, 20 : 20 + side] = 0.9
-    ends, small = speckle_free(depth, depth > 0.0, regions(depth), 100)
+    ends, small = speckle_free(depth, depth > 0.0, regions=regions(depth), least=100)
     assert small == side**2
     np.testing.assert_array_equal(ends, np.full((40, 60), 0.6))
     depth[30, 30] = 0.4  # ends at itself
-    ends, small = speckle_free(depth, depth > 0.0, regions(depth), 100)
+    ends, small = speckle_free(depth, depth > 0.0, regions=regions(depth), least=100)
     assert (small, ends[30, 30], ends[30, 31]) == (side**2 + 1, 0.4, 0.6)
-    assert speckle_free(depth, depth > 0.0, regions(depth), 0)[1] == 0
+    assert speckle_free(depth, depth > 0.0, regions=regions(depth), least=0)[1] == 0
 
 
-def surface(count, size, centre):
+def surface(count, size, *, centre):
     """Random points on a square (count, 3)."""
     plane = np.random.default_rng(count).uniform(-0.5, 0.5, (count, 2)) * size
     return np.pad(plane, ((0, 0), (0, 1))) + centre
 
 
 def test_points_are_one_region_up_to_the_gap_and_others_beyond():
-    one, other = surface(2000, 0.1, (0, 0, 0)), surface(300, 0.03, (0.2, 0, 0))
+    one, other = surface(2000, 0.1, centre=(0, 0, 0)), surface(300, 0.03, centre=(0.2, 0, 0))
     found = point_regions(np.concatenate([one, other]), 0.02)
     assert (np.unique(found[:2000]).tolist(), np.unique(found[2000:]).tolist()) == ([1], [2])
     near = other - [0.2 - 0.05 - 0.015 - 0.015, 0.0, 0.0]  # 15 mm aside of the first
@@ -137,7 +142,7 @@ def test_points_are_one_region_up_to_the_gap_and_others_beyond():
 
 
 def test_sparse_points_are_one_region_whatever_the_gap():
-    sparse = surface(400, 1.0, (0, 0, 0))  # about 25 mm apart
+    sparse = surface(400, 1.0, centre=(0, 0, 0))  # about 25 mm apart
     assert np.bincount(point_regions(sparse, 0.001))[1:].max() > 390
     touches = np.array([[0.0, 0, 0], [0.05, 0, 0], [0, 0.05, 0]])
     assert point_regions(touches, 0.02).tolist() == [1, 1, 1]

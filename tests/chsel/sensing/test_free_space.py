@@ -24,7 +24,7 @@ from tests.chsel.samples import box_distance, random_poses
 
 SPACING = 0.01
 WORKSPACE = Workspace((0.7, -0.2, 0.31), (1.1, 0.2, 0.6))  # the cabinet's
-CAMERA = PinholeCamera(64, 48, 60.0, 62.0, 31.2, 23.9)
+CAMERA = PinholeCamera(64, 48, fx=60.0, fy=62.0, cx=31.2, cy=23.9)
 LOOKING_ALONG_X = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 TILTED = axis_angle(np.array([0.0, 1.0, 0.0]), 0.5) @ LOOKING_ALONG_X
 POSE = compose(TILTED, np.array([0.35, 0.02, 0.8]))
@@ -62,7 +62,9 @@ def test_a_ray_into_the_workspace_begins_at_its_border():
 
 
 def test_random_rays_mark_what_they_meet_and_nothing_far_from_them():
-    stream, together, every = np.random.default_rng(0), grid(), set()
+    stream = np.random.default_rng(0)
+    together = grid()
+    every = set()
     origins, ends = stream.uniform([0.5, -0.4, 0.2], [1.3, 0.4, 0.8], (2, 40, 3))
     for a, b in zip(origins, ends, strict=True):
         free = grid()
@@ -89,7 +91,8 @@ def test_points_are_in_the_voxels_of_the_lattice():
     stream = np.random.default_rng(2)
     points = stream.uniform([0.7, -0.2, 0.31], [1.1, 0.2, 0.6], (500, 3))
     points[:50] = np.rint(points[:50] * 200.0) / 200.0  # on faces, edges and corners
-    free, reference = grid(), FreeVoxels(Lattice(WORKSPACE.lower, SPACING))
+    free = grid()
+    reference = FreeVoxels(Lattice(WORKSPACE.lower, SPACING))
     for half in (points[:300], points[200:]):
         free.at(half)
         np.testing.assert_array_equal(free.new(), reference.add(half))
@@ -99,7 +102,7 @@ def test_points_are_in_the_voxels_of_the_lattice():
 
 def test_an_image_is_the_rays_of_its_pixels():
     by_image, by_rays = grid(), grid()
-    fresh = by_image.from_depth(DEPTH, CAMERA, POSE, MASK, fraction=0.9)
+    fresh = by_image.from_depth(DEPTH, CAMERA, world_from_camera=POSE, mask=MASK, fraction=0.9)
     with np.errstate(invalid="ignore"):
         ends = rotated(POSE[:3, :3], CAMERA.back_project(0.9 * DEPTH)[MASK]) + POSE[:3, 3]
     assert by_rays.along_rays(POSE[:3, 3], ends) == fresh > 5000
@@ -113,7 +116,7 @@ def test_the_number_of_threads_changes_nothing(monkeypatch):
     for count in (1, 2, 3):
         free = grid()
         with threads(count):
-            free.from_depth(DEPTH, CAMERA, POSE, MASK)
+            free.from_depth(DEPTH, CAMERA, world_from_camera=POSE, mask=MASK)
             free.at(CAMERA.back_project(DEPTH)[MASK], poses=POSE)
         assert free.count > 5000
         found.append(free.new())
@@ -140,11 +143,11 @@ def test_sizes_shapes_and_poses_that_do_not_fit_are_refused():
         grid(views=251)
     free = grid()
     with pytest.raises(PointsError, match=r"depth has shape \(64, 48\); accepted: \(48, 64\)"):
-        free.from_depth(DEPTH.T, CAMERA, POSE, MASK)
+        free.from_depth(DEPTH.T, CAMERA, world_from_camera=POSE, mask=MASK)
     with pytest.raises(PointsError, match=r"mask has shape \(48,\)"):
-        free.from_depth(DEPTH, CAMERA, POSE, MASK[:, 0])
+        free.from_depth(DEPTH, CAMERA, world_from_camera=POSE, mask=MASK[:, 0])
     with pytest.raises(PoseError, match="world_from_camera"):
-        free.from_depth(DEPTH, CAMERA, 2.0 * POSE, MASK)
+        free.from_depth(DEPTH, CAMERA, world_from_camera=2.0 * POSE, mask=MASK)
     with pytest.raises(PointsError, match="origin has 2 points; accepted: 1, or 5"):
         free.along_rays(np.zeros((2, 3)), np.zeros((5, 3)))
     assert free.count == 0
@@ -157,16 +160,19 @@ places = st.tuples(*[st.integers(-12, 32).map(lambda n: n / 4.0)] * 3)
 
 def marked(a, b):
     met = np.zeros(COUNTS, dtype=np.uint8)
-    grid = MarkedVoxels(met.reshape(-1), COUNTS, LOWER, 1.0)
-    mark_segments(grid, np.array([a]), np.array([b]), 0, 1)
+    grid = MarkedVoxels(met.reshape(-1), COUNTS, lower=LOWER, spacing=1.0)
+    mark_segments(grid, np.array([a]), ends=np.array([b]), first=0, last=1)
     assert met.max() <= 1
     return {tuple(voxel) for voxel in np.argwhere(met).tolist()}
 
 
-def overlap(voxel, a, b):
+def overlap(voxel, a, *, b):
     """How much of the segment is in the voxel with its faces (below 0: none), and whether within
-    it alone: not in a face that it shares with the next lower voxel."""
-    enters, leaves, within = Fraction(0), Fraction(1), True
+    it alone: not in a face that it shares with the next lower voxel.
+    """
+    enters = Fraction(0)
+    leaves = Fraction(1)
+    within = True
     for k, start, end in zip(voxel, map(Fraction, a), map(Fraction, b), strict=True):
         d = end - start
         if d == 0:
@@ -184,7 +190,7 @@ def overlap(voxel, a, b):
 def test_all_voxels_that_are_passed_are_marked_and_joined_and_none_that_is_not_touched(a, b):
     found = marked(a, b)
     for voxel in np.ndindex(*COUNTS):
-        inside, within = overlap(voxel, a, b)
+        inside, within = overlap(voxel, a, b=b)
         assert voxel in found or not (inside > 0 and within)
         assert voxel not in found or inside >= 0
     for end in (a, b):
@@ -247,7 +253,7 @@ def test_nodes_of_solids_are_around_their_middles_and_off_their_faces():
 
 def test_nothing_moves_further_than_a_step_and_all_poses_lie_near_the_way():
     stream = np.random.default_rng(0)
-    poses = random_poses(stream, 6, 0.2)
+    poses = random_poses(stream, 6, reach=0.2)
     way = poses_between(poses, step=0.005, radius=0.1)
     np.testing.assert_array_equal(way[[0, -1]], poses[[0, -1]])
     points = stream.normal(size=(50, 3))

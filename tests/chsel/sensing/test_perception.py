@@ -212,7 +212,8 @@ def test_a_hand_whose_faces_look_inward_is_as_solid_as_another():
 
 
 def test_points_added_in_another_rounding_mode_are_refused():
-    session, library = chsel.Session(BOX), ctypes.CDLL("libm.so.6")
+    session = chsel.Session(BOX)
+    library = ctypes.CDLL("libm.so.6")
     usual = library.fegetround()
     library.fesetround(0x800)  # upward, on x86-64
     try:

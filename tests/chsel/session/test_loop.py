@@ -58,7 +58,15 @@ def test_every_problem_has_all_points_and_follows_from_the_result_before():
     for step, problem in walk(loop_of(seed=7, points=points)).items():
         points = points.merged(NEW_POINTS[step])
         key = StreamKey(7, step)
-        expected = pose_problem(GRID, points, WORKSPACE, 0.01, key, SETTINGS, previous)
+        expected = pose_problem(
+            GRID,
+            points,
+            workspace=WORKSPACE,
+            free_resolution=0.01,
+            key=key,
+            settings=SETTINGS,
+            previous=previous,
+        )
         assert problem.digest == expected.digest
         previous = starts_as_found(expected)
     assert points.count == 5
@@ -86,7 +94,8 @@ def test_nothing_is_registered_while_no_point_is_known():
 
 
 def test_without_a_result_the_next_problem_follows_from_the_one_before():
-    loop, sizes = loop_of(), []
+    loop = loop_of()
+    sizes = []
     for problem in loop.problems(PROBES[:3]):
         sizes.append(len(problem.low_cost_set))
         if problem.key.step == 0:
@@ -162,7 +171,7 @@ def surprised_by(outcome, decided_step, *, forecast=True):
     loop = steered(Somebody())
     decided = loop.decide(ALL)
     decision = decided.decision if forecast else replace(decided.decision, contacts=NOWHERE)
-    loop.follow(Decided(decided_step, decided.problem, decision, 0.0))
+    loop.follow(Decided(decided_step, decided.problem, decision=decision, surprise=0.0))
     loop.perceive(replace(touch(0, KnownPoints(), contacts=[9.0, 9.0, 9.0]), outcome=outcome))
     return loop.state.surprise
 

@@ -28,10 +28,12 @@ SCALARS = {
 def values_of(draw, name):
     """Any values that a message of the table can have."""
     lengths: dict[str, int] = {}
-    return {field: draw(_value(kind, lengths, draw)) for field, kind in field_kinds(name).items()}
+    return {
+        field: draw(_value(kind, lengths, draw=draw)) for field, kind in field_kinds(name).items()
+    }
 
 
-def _value(kind, lengths, draw):
+def _value(kind, lengths, *, draw):
     if kind.dtype is not None:
         shape = tuple(
             int(side)

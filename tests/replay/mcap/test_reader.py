@@ -21,7 +21,8 @@ def rewritten(path, change):
     """
     copy = path.with_suffix(".changed.mcap")
     with path.open("rb") as source, copy.open("wb") as target:
-        reader, writer = make_reader(source), Writer(target, enable_data_crcs=True)
+        reader = make_reader(source)
+        writer = Writer(target, enable_data_crcs=True)
         writer.start("chsel", "")
         for attachment in reader.iter_attachments():
             data = change(attachment.name, attachment.data)
@@ -80,7 +81,8 @@ def test_problems_are_rebuilt_from_the_file_alone(events, write):
 
 
 def test_other_files_are_refused(tmp_path):
-    path, others = tmp_path / "recording.mcap", io.BytesIO()
+    path = tmp_path / "recording.mcap"
+    others = io.BytesIO()
     writer = Writer(others)
     writer.start("ros2", "")
     writer.finish()

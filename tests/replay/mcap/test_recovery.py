@@ -41,7 +41,8 @@ from tests.tools.small_recordings import registered_session
 
 def recorded(path, events, *flush_before):
     """A recording of events with a chunk for each probe, as a session leaves it."""
-    recorder, flushed = McapRecorder(path), -1
+    recorder = McapRecorder(path)
+    flushed = -1
     for event in events:
         is_first = isinstance(event, Probe | SensorImage) and event.step > flushed
         if is_first or isinstance(event, (SessionEnded, *flush_before)):
@@ -171,7 +172,8 @@ def test_decisions_without_their_actions_are_lost(tmp_path, steered_events):
 def test_each_decision_comes_back_on_the_actions_that_were_offered_last(tmp_path, steered_events):
     """Others are offered before the second decision, and the end of the file is cut off."""
     first = nth(steered_events, ActionsOffered)
-    second, place = nth(steered_events, Decided, 1), 0
+    second = nth(steered_events, Decided, number=1)
+    place = 0
     turn = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(1.1)), np.array([0.3, 0.2, 0.1]))
     others = Actions(turn @ first.actions.world_from_hand, first.actions.length + 0.1)
     offered = dataclasses.replace(first, step=second.step, actions=others)
@@ -214,12 +216,12 @@ def test_a_damaged_grid_is_made_again_from_the_mesh(
     path, out = tmp_path / "damaged.mcap", tmp_path / "out.mcap"
     data = recorded(tmp_path / "whole.mcap", [start])
     place = data.index(b"sdf_grid") + 2000
-    path.write_bytes(flipped(data, place, place))
+    path.write_bytes(flipped(data, place, end=place))
     assert main(["recover", str(path), "-o", str(out)]) == 0
     assert "made again from the mesh, to the bit" in capsys.readouterr().out
     assert_same(without_marks([*read_recording(out).events()]), [start])
     place = data.index(b"end_header") + 20
-    path.write_bytes(flipped(data, place, place))
+    path.write_bytes(flipped(data, place, end=place))
     assert main(["recover", str(path), "-o", str(tmp_path / "no.mcap")]) == 2
     assert "nothing can be recovered" in (error := capsys.readouterr().err)
     assert "attachment mesh.ply has digest" in error
@@ -238,10 +240,11 @@ def live_session(path, **arguments):
 def damaged_grid(path):
     """The bytes of a recording with one bit flipped amid its grid."""
     data = path.read_bytes()
-    first, last = data.index(b"sdf_grid"), data.index(b"chsel.SdfGrid", data.index(b"sdf_grid"))
+    first = data.index(b"sdf_grid")
+    last = data.index(b"chsel.SdfGrid", data.index(b"sdf_grid"))
     middle = last + len(read_recording(path).start.sdf.values.tobytes()) // 4
     assert first < last < middle
-    return flipped(data, middle, middle)
+    return flipped(data, middle, end=middle)
 
 
 @pytest.mark.parametrize("arguments", [{}, {"resolution": 0.0045}])
@@ -369,7 +372,8 @@ def test_reading_and_recovering_a_damaged_recording(tmp_path, original, damage):
     if isinstance(found, str):
         assert not out.exists()
         return
-    kept, left = without_marks([*read_recording(out).events()]), iter(written)
+    kept = without_marks([*read_recording(out).events()])
+    left = iter(written)
     for event in kept:
         assert any(same_bits(event, one) for one in left), event
     assert isinstance(begin, str) or len(kept) >= len(begin)

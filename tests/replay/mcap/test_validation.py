@@ -96,7 +96,7 @@ WRONG: dict[str, Change] = {
     # numbers and texts
     "seconds has a number that": inserted(5, Timed(0, {"a": np.inf})),
     r"a name of values holds the character '\\x1b'": inserted(5, Measured(0, {"\x1b": 1.0})),
-    "a log line holds the character": inserted(5, Logged(0, "info", "\x00")),
+    "a log line holds the character": inserted(5, Logged(0, "info", text="\x00")),
     # sensors
     r"SensorImage of step 0: sensor is 'a/b'; accepted: letters, digits and _": first(
         SensorImage, sensor="a/b"
@@ -108,12 +108,12 @@ WRONG: dict[str, Change] = {
         RigDescribed, hand=trimesh.Trimesh(np.eye(3), [[0, 1, 3]], process=False)
     ),
     # order
-    "probe 0 follows probe 0": inserted(8, Probe(0, "free", KnownPoints())),
+    "probe 0 follows probe 0": inserted(8, Probe(0, "free", new_points=KnownPoints())),
     "step 1 has a second registration problem": repeated(ProblemPosed),
     "/hypotheses of step 1 is in no registration of it": repeated(HypothesesFound),
     "/archive of step 1 is in no registration": moved(HypothesesFound, SnapshotTaken),
     "an event follows the end of the session": repeated(SessionEnded),
-    "step 0 follows one of step 1": before(ProblemPosed, Logged(0, "info", "")),
+    "step 0 follows one of step 1": before(ProblemPosed, Logged(0, "info", text="")),
     "there is a rig of step -1; accepted: one, before all steps": repeated(RigDescribed),
     "an image of step 0 does not precede the probe of its": moved(SensorImage, SessionEnded),
 }
@@ -189,14 +189,14 @@ def test_a_recording_gives_actions_and_decisions_back(steered_events, write, ass
     ],
 )
 def test_a_decision_that_makes_no_sense_is_not_written(steered_events, write, values, message):
-    old = nth(steered_events, Decided, 1)
+    old = nth(steered_events, Decided, number=1)
     other = dataclasses.replace(old.decision, **values)
     with pytest.raises(RecordingError, match=message):
         write(changed(steered_events, old, decision=other))
 
 
 def test_a_decision_is_of_the_actions_and_points_before_it(steered_events, write):
-    one, other = (nth(steered_events, Decided, number) for number in (0, 1))
+    one, other = (nth(steered_events, Decided, number=number) for number in (0, 1))
     for change, message in (
         (without(ActionsOffered), "a decision of step -1 has no actions before it"),
         (

@@ -45,7 +45,7 @@ def test_a_scene_holds_the_object_at_each_distinct_hypothesis(events, write):
     scene = SceneUpdate.FromString(data)
     assert scene.SerializeToString(deterministic=True) == data  # put together of bytes
     (entity,) = scene.entities
-    found = nth(events, HypothesesFound, -1).hypotheses
+    found = nth(events, HypothesesFound, number=-1).hypotheses
     poses = inverse(found.object_from_world[~found.duplicate])
     assert len(entity.triangles) == len(poses) == 3
     box = events[0].mesh
@@ -85,7 +85,7 @@ def test_the_last_clouds_of_all_topics_hold_all_points_known_at_that_time(write)
 
 
 def test_the_next_probe_is_an_arrow_from_start_to_end(steered_events):
-    first, last = (nth(steered_events, Decided, number) for number in (0, -1))
+    first, last = (nth(steered_events, Decided, number=number) for number in (0, -1))
     (entity,) = SceneUpdate.FromString(next_probe(first, 5)).entities
     (arrow,) = entity.arrows
     pose = first.problem.actions.world_from_hand[first.decision.chosen]
@@ -103,11 +103,22 @@ def test_modes_are_ellipsoids_of_two_standard_deviations():
     turn = axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7))
     covariances = np.zeros((2, 6, 6))
     covariances[0, :3, :3] = turn @ np.diag([0.01, 0.02, 0.03]) ** 2 @ turn.T
-    centres, poses = np.array([[0.1, 0.2, 0.3], [0.0, 0.0, 0.5]]), np.stack([np.eye(4)] * 2)
-    believed = Believed(3, np.array([4, 0]), np.array([0.9, 0.1]), poses, centres, covariances, 0.1)
+    centres = np.array([[0.1, 0.2, 0.3], [0.0, 0.0, 0.5]])
+    poses = np.stack([np.eye(4)] * 2)
+    believed = Believed(
+        3,
+        np.array([4, 0]),
+        weights=np.array([0.9, 0.1]),
+        object_from_world=poses,
+        centres=centres,
+        covariances=covariances,
+        spread=0.1,
+    )
     (entity,) = SceneUpdate.FromString(modes(believed, 5)).entities
     first, second = entity.spheres
-    size, position, q = first.size, first.pose.position, first.pose.orientation
+    size = first.size
+    position = first.pose.position
+    q = first.pose.orientation
     np.testing.assert_allclose([size.x, size.y, size.z], [0.04, 0.08, 0.12])
     np.testing.assert_allclose([position.x, position.y, position.z], centres[0])
     axes = rotation_matrices(np.array([[q.x, q.y, q.z, q.w]]))[0]
@@ -120,7 +131,7 @@ def test_modes_are_ellipsoids_of_two_standard_deviations():
 
 def test_poses_and_the_true_pose_are_there_to_the_bit(events, write):
     path = write(events)
-    found = nth(events, HypothesesFound, -1).hypotheses
+    found = nth(events, HypothesesFound, number=-1).hypotheses
     poses = PosesInFrame.FromString(messages(path, "/hypothesis_poses")[-1][2]).poses
     positions = [[pose.position.x, pose.position.y, pose.position.z] for pose in poses]
     assert positions == inverse(found.object_from_world)[:, :3, 3].tolist()

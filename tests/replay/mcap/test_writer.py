@@ -19,7 +19,7 @@ from tests.replay.conftest import changed, nth
 CONFTEST = Path(__file__).parents[1] / "conftest.py"
 
 
-def run_script(script, path, hash_seed="0"):
+def run_script(script, path, *, hash_seed="0"):
     """Run a script that finds the example's functions in `example` and a path in `path`."""
     head = f"import runpy; example = runpy.run_path({str(CONFTEST)!r}); path = {str(path)!r}\n"
     return subprocess.run(
@@ -39,7 +39,7 @@ for event in example["example_events"]():
     recorder.record(event)
 recorder.close()
 """
-    result = run_script(script, tmp_path / "a.mcap", "1")
+    result = run_script(script, tmp_path / "a.mcap", hash_seed="1")
     assert result.returncode == 0, result.stderr
     recorder = McapRecorder(tmp_path / "b.mcap")
     for event in events:

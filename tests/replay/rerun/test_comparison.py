@@ -46,7 +46,7 @@ def judge_of(recording, step):
 @pytest.fixture
 def saved(recording, results, tmp_path):
     path = tmp_path / "comparison.rrd"
-    save_comparison(path, recording, results)
+    save_comparison(path, recording, results=results)
     return path
 
 
@@ -56,7 +56,7 @@ def test_hypotheses_stand_at_their_poses_with_the_costs_of_one_judge(saved, reco
     for n, label in enumerate(results):
         found = results[label][1]
         distinct = found.object_from_world[~found.duplicate]
-        shown = shown_poses(rows, f"/hypotheses/{n}", 1)
+        shown = shown_poses(rows, f"/hypotheses/{n}", step=1)
         expected = dict(zip(judge.evaluate(distinct).tolist(), inverse(distinct), strict=True))
         assert sorted(shown) == sorted(expected)
         for cost, pose in expected.items():
@@ -64,7 +64,8 @@ def test_hypotheses_stand_at_their_poses_with_the_costs_of_one_judge(saved, reco
 
 
 def test_ranking_sorts_all_that_belongs_to_a_hypothesis(recording):
-    found, judge = recording.hypotheses(1), judge_of(recording, 1)
+    found = recording.hypotheses(1)
+    judge = judge_of(recording, 1)
     again = ranked(found, judge)
     order = np.argsort(judge.evaluate(found.object_from_world))
     assert (np.diff(again.cost) >= 0.0).all()

@@ -30,7 +30,7 @@ ACTIONS = Actions(
 HAND = HandShape.of(trimesh.creation.box(extents=(0.02, 0.04, 0.1)))
 
 
-def decided(step, chosen, score, stop=""):
+def decided(step, chosen, *, score, stop=""):
     problem = DecisionProblem(
         sdf=SDF,
         points=KnownPoints(),
@@ -53,24 +53,26 @@ def decided(step, chosen, score, stop=""):
         expected_spread=np.array([0.03, 0.04, 0.05]) / (step + 2),
         contacts=np.array(contacts),
     )
-    return Decided(step, problem, decision, surprise=0.5 * (step + 1))
+    return Decided(step, problem, decision=decision, surprise=0.5 * (step + 1))
 
 
 def probe(step, *, hit):
     path = compose(np.tile(np.eye(3), (2, 1, 1)), np.array([[0.0, 0.0, -0.6], [0.0, 0.0, -0.3]]))
     contacts = np.array([[0.0, 0.0, -0.15]]) if hit else np.zeros((0, 3))
     points = KnownPoints(free=np.full((1, 3), 0.1 * step), known=contacts)
-    return Probe(step, "contact" if hit else "free", points, gripper_path=path, contacts=contacts)
+    return Probe(
+        step, "contact" if hit else "free", new_points=points, gripper_path=path, contacts=contacts
+    )
 
 
 def session():
     yield dataclasses.replace(started(None), initial_points=KnownPoints())
-    yield ActionsOffered(-1, ACTIONS, HAND)
-    yield decided(-1, 0, [3.0, 1.0, 2.0])
+    yield ActionsOffered(-1, ACTIONS, hand=HAND)
+    yield decided(-1, 0, score=[3.0, 1.0, 2.0])
     yield probe(0, hit=True)
-    yield decided(0, 2, [-np.inf, -np.inf, 7.0])
+    yield decided(0, 2, score=[-np.inf, -np.inf, 7.0])
     yield probe(1, hit=False)
-    yield decided(1, -1, [-np.inf] * 3, stop="actions")
+    yield decided(1, -1, score=[-np.inf] * 3, stop="actions")
     yield SessionEnded(1, "finished")
 
 
@@ -95,7 +97,7 @@ def test_the_next_probe_and_its_forecast_stand_at_the_step_before_it(rows, step,
 def test_actions_that_are_offered_later_take_the_place_of_the_first(tmp_path):
     fewer = Actions(ACTIONS.world_from_hand[[2, 1]], ACTIONS.length[[2, 1]])
     before = [*session()][:-2]
-    later = [ActionsOffered(1, fewer, HAND), SessionEnded(1, "finished")]
+    later = [ActionsOffered(1, fewer, hand=HAND), SessionEnded(1, "finished")]
     rows = read(write(tmp_path / "b.rrd", [*before, *later]))["/scene/actions/offered"]
     for step, actions in ((-1, ACTIONS), (0, ACTIONS), (1, fewer)):
         starts = shown_at(rows, step)["Arrows3D:origins"]

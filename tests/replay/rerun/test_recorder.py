@@ -72,42 +72,87 @@ def probe(step):
     )
     path = compose(np.tile(ALONG_X, (4, 1, 1)), np.array(ways))
     normals = np.outer(np.arange(1 + step) > 0, [1.0, 0.0, 0.0])  # that of the first is unknown
-    return Probe(step, "contact", points, path, contacts, normals)
+    return Probe(
+        step,
+        "contact",
+        new_points=points,
+        gripper_path=path,
+        contacts=contacts,
+        contact_normals=normals,
+    )
 
 
 def snapshot(iteration, shape=(4, 3)):
-    cells, axes = np.arange(iteration + 2), len(shape)
+    cells = np.arange(iteration + 2)
+    axes = len(shape)
     return ArchiveSnapshot(
         iteration,
         0,
-        ("x [m]", "y [m]", "z [m]")[:axes],
-        shape,
-        np.full(axes, -0.3),
-        np.full(axes, 0.3),
-        cells,
-        np.zeros((len(cells), 9)),
-        -1.0 - np.arange(len(cells), dtype=np.float64),
-        np.zeros((len(cells), axes)),
+        measure_names=("x [m]", "y [m]", "z [m]")[:axes],
+        shape=shape,
+        lower=np.full(axes, -0.3),
+        upper=np.full(axes, 0.3),
+        cells=cells,
+        solutions=np.zeros((len(cells), 9)),
+        objectives=-1.0 - np.arange(len(cells), dtype=np.float64),
+        measures=np.zeros((len(cells), axes)),
     )
 
 
 def hypotheses(archive):
-    rng, count = np.random.default_rng(6), 6
+    rng = np.random.default_rng(6)
+    count = 6
     poses = compose(random_rotations(rng, count), rng.uniform(-0.2, 0.2, (count, 3)))
     cost = 1.5 * np.arange(1, count + 1, dtype=np.float64) ** 2
-    return Hypotheses(poses, cost, np.arange(count) % 4 == 2, np.arange(count), poses, archive)
+    return Hypotheses(
+        poses,
+        cost,
+        duplicate=np.arange(count) % 4 == 2,
+        cell=np.arange(count),
+        elites=poses,
+        archive=archive,
+    )
 
 
 def registration(step, *, shape=(4, 3)):
     problem = RegistrationProblem(
-        SDF, INITIAL, np.eye(4)[None], WORKSPACE, 0.025, StreamKey(3, step)
+        sdf=SDF,
+        points=INITIAL,
+        initial_set=np.eye(4)[None],
+        workspace=WORKSPACE,
+        free_resolution=0.025,
+        key=StreamKey(3, step),
     )
     yield ProblemPosed(step, problem)
-    yield Traced(step, "gradient_descent", 0, "0", 2.0, 3.0, 900.0)
-    yield Traced(step, "gradient_descent", 50, "0", 1.0, 2.0, 90.0 + step)
+    yield Traced(
+        step,
+        "gradient_descent",
+        iteration=0,
+        digest="0",
+        lowest_cost=2.0,
+        median_cost=3.0,
+        highest_cost=900.0,
+    )
+    yield Traced(
+        step,
+        "gradient_descent",
+        iteration=50,
+        digest="0",
+        lowest_cost=1.0,
+        median_cost=2.0,
+        highest_cost=90.0 + step,
+    )
     for iteration in (0, 5):
         yield SnapshotTaken(step, snapshot(iteration, shape))
-        yield Traced(step, "quality_diversity", iteration, "0", 0.5, 1.0, 2.0)
+        yield Traced(
+            step,
+            "quality_diversity",
+            iteration=iteration,
+            digest="0",
+            lowest_cost=0.5,
+            median_cost=1.0,
+            highest_cost=2.0,
+        )
     yield HypothesesFound(step, hypotheses(snapshot(5, shape)))
     errors = {"best_position_error": 0.01 * (step + 1), "best_rotation_error": 0.5 * (step + 1)}
     yield Measured(step, {**errors, "coverage_mm2": 4.0, "set_spread": 0.003})
@@ -116,20 +161,37 @@ def registration(step, *, shape=(4, 3)):
 
 def depth(step, *, height=4, width=6):
     values = np.arange(height * width, dtype=np.uint16).reshape(height, width) * 50
-    return SensorImage(step, "camera", "depth", values, 0.001, values > 200, INTRINSICS, CAMERA)
+    return SensorImage(
+        step=step,
+        sensor="camera",
+        kind="depth",
+        values=values,
+        unit=0.001,
+        mask=values > 200,
+        intrinsics=INTRINSICS,
+        world_from_camera=CAMERA,
+    )
 
 
 def touch(step, pixels):
     values = np.zeros((3, 5), dtype=np.uint16)
     values.flat[:pixels] = 60
-    seen = (values, 0.0001, values > 40, INTRINSICS, CAMERA)
-    return SensorImage(step, "pad_1", "deformation", *seen)
+    return SensorImage(
+        step=step,
+        sensor="pad_1",
+        kind="deformation",
+        values=values,
+        unit=0.0001,
+        mask=values > 40,
+        intrinsics=INTRINSICS,
+        world_from_camera=CAMERA,
+    )
 
 
 def session():
     """Three probes, with two images of a camera before each; the pad tells nothing of the last."""
     yield started()
-    yield RigDescribed(-1, "cabinet", "0a1b", HAND)
+    yield RigDescribed(-1, "cabinet", source="0a1b", hand=HAND)
     for step in range(3):
         yield from (depth(step), dataclasses.replace(depth(step), unit=0.002))
         yield from (touch(step, pixels) for pixels in (1, 7, 4) if step < 2)
@@ -146,13 +208,17 @@ def write(path, events):
     return path
 
 
-def shown_poses(rows, root, step):
+def shown_poses(rows, root, *, step):
     """The poses (4, 4) at which hypotheses are shown at a probe, by their costs."""
     poses: dict[float, np.ndarray] = {}
     for entity in ("best", *(f"cost_step_{level + 1}" for level in range(LEVELS))):
         row = shown_at(rows[f"{root}/{entity}"], step)
-        places = row["InstancePoses3D:translations"], row["InstancePoses3D:mat3x3"]
-        for cost, where, turn in zip(row["cost"], *places, strict=True):
+        for cost, where, turn in zip(
+            row["cost"],
+            row["InstancePoses3D:translations"],
+            row["InstancePoses3D:mat3x3"],
+            strict=True,
+        ):
             if not np.isnan(cost):  # turn: column by column
                 poses[cost] = compose(np.reshape(turn, (3, 3)).T, np.array(where))
     return poses
@@ -193,7 +259,7 @@ def test_every_distinct_hypothesis_is_drawn_once_at_its_pose(rows):
     expected = hypotheses(snapshot(5))
     distinct = np.flatnonzero(~expected.duplicate)
     for step in range(3):
-        shown = shown_poses(rows, "/scene/hypotheses", step)
+        shown = shown_poses(rows, "/scene/hypotheses", step=step)
         assert sorted(shown) == expected.cost[distinct].tolist()
         for index in distinct:
             world_from_object = inverse(expected.object_from_world[index])
@@ -201,7 +267,7 @@ def test_every_distinct_hypothesis_is_drawn_once_at_its_pose(rows):
             np.testing.assert_allclose(pose, world_from_object, atol=1e-6)
 
 
-def images(rows, step, dtype, channels):
+def images(rows, step, *, dtype, channels):
     """The pictures of a probe, each in the format that was given last."""
     found, shape = [], (0, 0)
     for times, row in rows:
@@ -215,12 +281,12 @@ def images(rows, step, dtype, channels):
 
 
 def test_the_archive_shows_the_cost_of_each_cell_and_marks_empty_ones(rows):
-    first, last = images(rows["/archive/cost"], 1, np.float32, 1)
+    first, last = images(rows["/archive/cost"], 1, dtype=np.float32, channels=1)
     expected = np.full((3, 4), np.nan)  # cells 0 and 1 of 4 x 3: first column, from below
     expected[2, 0], expected[1, 0] = 1.0, 2.0
     np.testing.assert_array_equal(first[..., 0], expected)
     assert np.isfinite(last).sum() == 7
-    colors = images(rows["/archive/colors"], 1, np.uint8, 3)[-1]
+    colors = images(rows["/archive/colors"], 1, dtype=np.uint8, channels=3)[-1]
     empty = np.isnan(last[..., 0])
     assert len(np.unique(colors[empty], axis=0)) == 1
     assert len(np.unique(colors[~empty], axis=0)) == 7
@@ -229,7 +295,7 @@ def test_the_archive_shows_the_cost_of_each_cell_and_marks_empty_ones(rows):
 def test_of_cells_over_a_third_measure_the_lowest_cost_is_shown(tmp_path):
     events = [started(), probe(0), *registration(0, shape=(4, 3, 2))]
     rows = read(write(tmp_path / "a.rrd", events))
-    costs = images(rows["/archive/cost"], 0, np.float32, 1)[-1][..., 0]
+    costs = images(rows["/archive/cost"], 0, dtype=np.float32, channels=1)[-1][..., 0]
     assert costs[2, 0] == 1.0  # cells 0 and 1, of costs 1 and 2
     assert costs[1, 0] == 3.0
 
@@ -237,9 +303,18 @@ def test_of_cells_over_a_third_measure_the_lowest_cost_is_shown(tmp_path):
 def test_modes_are_ellipsoids_of_two_deviations_and_their_weights_are_in_the_result(tmp_path):
     covariance = np.zeros((2, 6, 6))
     covariance[0, :3, :3] = np.diag([0.04, 0.01, 0.09]) ** 2
-    weights, centres = np.array([0.75, 0.25]), np.array([[0.1, 0.0, 0.2], [0.0, 0.3, 0.1]])
+    weights = np.array([0.75, 0.25])
+    centres = np.array([[0.1, 0.0, 0.2], [0.0, 0.3, 0.1]])
     poses = np.stack([np.eye(4)] * 2)
-    believed = Believed(0, np.array([5, 2]), weights, poses, centres, covariance, 0.1)
+    believed = Believed(
+        0,
+        np.array([5, 2]),
+        weights=weights,
+        object_from_world=poses,
+        centres=centres,
+        covariances=covariance,
+        spread=0.1,
+    )
     drawn = read(write(tmp_path / "a.rrd", [started(), probe(0), *registration(0), believed]))
     modes = shown_at(drawn["/scene/modes"], 0)
     np.testing.assert_allclose(modes["Ellipsoids3D:centers"], centres, atol=1e-7)

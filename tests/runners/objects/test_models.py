@@ -21,12 +21,12 @@ class Scan(NamedTuple):
 
 
 SCANS = {
-    "drill": Scan("035_power_drill", (160.5, 121.0, 191.5), 641),
-    "mustard": Scan("006_mustard_bottle", (82.9, 94.0, 187.5), 719),
-    "hammer": Scan("048_hammer", (106.4, 332.6, 44.7), 399),
-    "cracker_box": Scan("003_cracker_box", (90.0, 167.8, 238.4), 2360),
-    "spam_can": Scan("010_potted_meat_can", (96.7, 88.4, 85.2), 390),
-    "clamp": Scan("050_medium_clamp", (43.5, 62.5, 83.5), 99.2),
+    "drill": Scan("035_power_drill", (160.5, 121.0, 191.5), volume=641),
+    "mustard": Scan("006_mustard_bottle", (82.9, 94.0, 187.5), volume=719),
+    "hammer": Scan("048_hammer", (106.4, 332.6, 44.7), volume=399),
+    "cracker_box": Scan("003_cracker_box", (90.0, 167.8, 238.4), volume=2360),
+    "spam_can": Scan("010_potted_meat_can", (96.7, 88.4, 85.2), volume=390),
+    "clamp": Scan("050_medium_clamp", (43.5, 62.5, 83.5), volume=99.2),
 }
 
 
@@ -40,7 +40,8 @@ def _distances(source, target):
 
 
 def _is_inside(mesh, points):
-    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64)
+    vertices = np.array(mesh.vertices)
+    faces = np.array(mesh.faces, dtype=np.int64)
     winding = igl.winding_number(vertices, faces, np.array(points) * 1e-3)
     return (winding > 0.5).tolist()
 
@@ -59,9 +60,14 @@ def test_a_model_is_one_closed_body_of_the_scans_size(name):
 
 def test_the_drill_has_a_body_a_chuck_a_handle_and_a_foot_with_space_between_them():
     drill = load_model("drill")
-    chuck, body, handle, foot = [72, 65, 161], [-40, -5, 155], [-18, 3, 75], [35, 35, 15]
+    chuck = [72, 65, 161]
+    body = [-40, -5, 155]
+    handle = [-18, 3, 75]
+    foot = [35, 35, 15]
     assert _is_inside(drill, [chuck, body, handle, foot]) == [True] * 4
-    before_handle, behind_handle, below_chuck = [10, 20, 75], [-50, -20, 75], [60, 58, 125]
+    before_handle = [10, 20, 75]
+    behind_handle = [-50, -20, 75]
+    below_chuck = [60, 58, 125]
     assert _is_inside(drill, [before_handle, behind_handle, below_chuck]) == [False] * 3
 
 

@@ -25,7 +25,7 @@ def in_foxgloves_messages(source, target, *, packed):
         channels: dict[str, int] = {}
         messages = make_reader(read, decoder_factories=[DecoderFactory()])
         for kind, channel, message, said in messages.iter_decoded_messages():
-            for again in _said_again(kind.name.split("/")[-1], said, packed):
+            for again in _said_again(kind.name.split("/")[-1], said, packed=packed):
                 if channel.topic not in channels:
                     name = again.DESCRIPTOR.full_name
                     schema = writer.register_schema(name, "protobuf", b"of no matter")
@@ -48,7 +48,7 @@ def _made(kind, said=None, **fields):
     return made(**{name: value for name, value in fields.items() if name in known})
 
 
-def _said_again(kind, said, packed):
+def _said_again(kind, said, *, packed):
     match kind:
         case "TFMessage":
             moved = [_transform(one) for one in said.transforms]

@@ -84,7 +84,9 @@ def ros2_sent(count=4):
         stamp = BEGIN + step * SECOND
         camera, base = {"header": header("camera", stamp)}, {"header": header("base", stamp)}
         above, moved = (compose(np.eye(3), np.array(p)) for p in ([0, 0, 1.0], [step, 0, 0.0]))
-        info = camera_info("camera", PinholeCamera(5, 3, 400.0, 410.0, 2.0, 1.0), stamp)
+        info = camera_info(
+            "camera", PinholeCamera(5, 3, fx=400.0, fy=410.0, cx=2.0, cy=1.0), stamp=stamp
+        )
         packed = {**camera, "format": "png", "data": png(depth(step))}
         quantised = struct.pack("<iff", 1, 100.0, -20.0) + packed["data"]
         inverse = {**camera, "format": "32FC1; compressedDepth png", "data": quantised}
@@ -94,10 +96,14 @@ def ros2_sent(count=4):
             (
                 "/tf_static",
                 "TFMessage",
-                {"transforms": [transform("base", "camera", above, stamp)]},
+                {"transforms": [transform("base", "camera", parent_from_child=above, stamp=stamp)]},
             ),
-            ("/tf", "TFMessage", {"transforms": [transform("world", "base", moved, stamp)]}),
-            ("/depth", "Image", image("camera", depth(step), stamp)),
+            (
+                "/tf",
+                "TFMessage",
+                {"transforms": [transform("world", "base", parent_from_child=moved, stamp=stamp)]},
+            ),
+            ("/depth", "Image", image("camera", depth(step), stamp=stamp)),
             ("/compressed", "CompressedImage", packed),
             ("/quantised", "CompressedImage", inverse),
             ("/info", "CameraInfo", info),
@@ -105,7 +111,7 @@ def ros2_sent(count=4):
             ("/poses", "PoseArray", {**base, "poses": [pose, pose]}),
             ("/point", "PointStamped", {**base, "point": {"x": 1.0, "z": 2.0}}),
             ("/wrench", "WrenchStamped", {"header": header("hand", stamp), "wrench": wrench}),
-            ("/joints", "JointState", joint_state(["elbow", "wrist"], [0.5, -0.25], stamp)),
+            ("/joints", "JointState", joint_state(["elbow", "wrist"], [0.5, -0.25], stamp=stamp)),
             ("/cloud", "PointCloud2", ros2_cloud(np.arange(6.0).reshape(2, 3), stamp)),
             ("/probe", "String", {"data": f"begin {step}"}),
             ("/touch", "Bool", {"data": step % 2 == 0}),

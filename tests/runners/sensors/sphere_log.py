@@ -13,14 +13,15 @@ from tests.runners.sensors.small_logs import BEGIN, SECOND, ros2_cloud
 
 LATENCY = 4_000_000  # ns from a stamp to its log time
 
-CENTRE, RADIUS = np.array([0.9, 0.0, 0.45]), 0.04
+CENTRE = np.array([0.9, 0.0, 0.45])
+RADIUS = 0.04
 WALL = 1.08  # m: x of a wall behind the sphere
 MEMBRANE = 0.06  # m: from the pad's camera to its untouched membrane, a plane
 PRESSED = 0.012  # m: how far the membrane's plane reaches into the sphere at the end of a push
 ASIDE = 0.12  # m: by which the second probe passes the sphere
 
-OUTER = PinholeCamera(96, 72, 90.0, 90.0, 47.5, 35.5)
-INNER = PinholeCamera(48, 36, 50.0, 50.0, 23.5, 17.5)
+OUTER = PinholeCamera(96, 72, fx=90.0, fy=90.0, cx=47.5, cy=35.5)
+INNER = PinholeCamera(48, 36, fx=50.0, fy=50.0, cx=23.5, cy=17.5)
 
 # The hand's z axis, and so that of the pad's camera, is the world's x axis.
 FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -36,10 +37,15 @@ RIG = Rig(
     workspace=((0.7, 1.1), (-0.2, 0.2), (0.3, 0.6)),
     cameras=(
         CameraRig(
-            "camera", "/camera/depth", "/camera/info", range=(0.1, 2.0), rate=None, edge_reach=1
+            "camera",
+            "/camera/depth",
+            info="/camera/info",
+            range=(0.1, 2.0),
+            rate=None,
+            edge_reach=1,
         ),
     ),
-    bubbles=(BubbleRig("pad", "/pad/depth", "/pad/info", range=(0.01, 0.1)),),
+    bubbles=(BubbleRig("pad", "/pad/depth", info="/pad/info", range=(0.01, 0.1)),),
     contact=ContactRig(filter=3, points=50),
     hand=HandRig("hand", boxes=(BoxRig((0.04, 0.06, 0.08), (0.0, 0.0, 0.04)),)),
     markers="/probe",
@@ -75,7 +81,13 @@ class SphereLog:
             for tick in range(101):
                 self._send(writer, tick)
             for seconds, text in self.marks:
-                self._add(writer, "/probe", "std_msgs/String", {"data": text}, time_of(seconds))
+                self._add(
+                    writer,
+                    "/probe",
+                    kind="std_msgs/String",
+                    message={"data": text},
+                    sent=time_of(seconds),
+                )
         return path
 
     def _send(self, writer, tick):
@@ -83,19 +95,31 @@ class SphereLog:
         stamp, hand = time_of(seconds), hand_pose(seconds)
         lost, found = self.lost_transforms
         if not lost <= seconds < found:
-            moving = {"transforms": [transform("world", "hand", hand, stamp)]}
-            self._add(writer, "/tf", "tf2_msgs/TFMessage", moving, stamp)
+            moving = {
+                "transforms": [transform("world", "hand", parent_from_child=hand, stamp=stamp)]
+            }
+            self._add(writer, "/tf", kind="tf2_msgs/TFMessage", message=moving, sent=stamp)
         if self.finger is not None:
-            joints = joint_state(["elbow", "finger"], [seconds, self.finger], stamp)
-            self._add(writer, "/joint_states", "sensor_msgs/JointState", joints, stamp)
+            joints = joint_state(["elbow", "finger"], [seconds, self.finger], stamp=stamp)
+            self._add(
+                writer, "/joint_states", kind="sensor_msgs/JointState", message=joints, sent=stamp
+            )
         if tick == 0:
             camera = WORLD_FROM_CAMERA if self.camera_frame is None else self.camera_frame
             fixed = [
-                transform("hand", "pad_frame", HAND_FROM_PAD, stamp),
-                transform("world", "camera_frame", camera, stamp),
-                transform("world", "lidar", compose(np.eye(3), LIDAR), stamp),
+                transform("hand", "pad_frame", parent_from_child=HAND_FROM_PAD, stamp=stamp),
+                transform("world", "camera_frame", parent_from_child=camera, stamp=stamp),
+                transform(
+                    "world", "lidar", parent_from_child=compose(np.eye(3), LIDAR), stamp=stamp
+                ),
             ]
-            self._add(writer, "/tf_static", "tf2_msgs/TFMessage", {"transforms": fixed}, stamp)
+            self._add(
+                writer,
+                "/tf_static",
+                kind="tf2_msgs/TFMessage",
+                message={"transforms": fixed},
+                sent=stamp,
+            )
         images = []
         if tick % 2 == 0:
             images.append(("pad", INNER, membrane(hand).astype(np.float32), stamp))
@@ -104,20 +128,22 @@ class SphereLog:
             ahead = stamp + round(is_ahead * self.camera_clock * SECOND)
             images.append(("camera", OUTER, np.rint(seen() / self.unit).astype(np.uint16), ahead))
         for name, camera, values, seen_at in images:
-            info = camera_info(f"{name}_frame", camera, seen_at)
+            info = camera_info(f"{name}_frame", camera, stamp=seen_at)
             if name == "camera":
                 info |= dict(self.info)
-            self._add(writer, f"/{name}/info", "sensor_msgs/CameraInfo", info, stamp)
-            depth = image(f"{name}_frame", values, seen_at)
-            self._add(writer, f"/{name}/depth", "sensor_msgs/Image", depth, stamp)
+            self._add(
+                writer, f"/{name}/info", kind="sensor_msgs/CameraInfo", message=info, sent=stamp
+            )
+            depth = image(f"{name}_frame", values, stamp=seen_at)
+            self._add(writer, f"/{name}/depth", kind="sensor_msgs/Image", message=depth, sent=stamp)
         if self.cloud and tick in (10, 40):
             cloud = ros2_cloud(np.array(self.cloud), stamp)
             for topic in ("/lidar", "/skin"):
-                self._add(writer, topic, "sensor_msgs/PointCloud2", cloud, stamp)
+                self._add(writer, topic, kind="sensor_msgs/PointCloud2", message=cloud, sent=stamp)
 
-    def _add(self, writer, topic, kind, message, sent):
+    def _add(self, writer, topic, *, kind, message, sent):
         if topic not in self.left_out:
-            writer.add(topic, kind, message, sent, sent + LATENCY)
+            writer.add(topic, kind, message=message, stamp=sent, log_time=sent + LATENCY)
 
 
 def time_of(seconds):

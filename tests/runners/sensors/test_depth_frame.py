@@ -23,7 +23,9 @@ from runners.sensors.depth_frame import depth_frame_points, read_depth_frame
 from runners.sensors.rig import GateRig, Rig
 from runners.sessions.sensors import SensorsSettings, open_sensors
 
-MODEL = ObjectModel("box", trimesh.creation.box((0.15, 0.1, 0.05)), 1.0, 0.001, "box")
+MODEL = ObjectModel(
+    "box", trimesh.creation.box((0.15, 0.1, 0.05)), scale=1.0, epsilon=0.001, configuration="box"
+)
 WIDTH, HEIGHT = 80, 60
 INTRINSICS = {"fx": 100.0, "fy": 110.0, "cx": 39.5, "cy": 29.5}
 BOX = (slice(20, 40), slice(30, 60))  # pixels of a box that faces the camera
@@ -40,7 +42,7 @@ def far(metres):
 
 def rig(**camera):
     values = yaml.safe_load((CONF / "session" / "rig" / "depth_frame.yaml").read_text())
-    built = build_settings(Rig, values, "session.rig")
+    built = build_settings(Rig, values, where="session.rig")
     (only,) = built.cameras
     return dataclasses.replace(built, cameras=(dataclasses.replace(only, **camera),))
 
@@ -99,7 +101,8 @@ def test_a_frame_is_read_with_all_its_parts(tmp_path):
 def tiff(values, sample_format):
     """A TIFF of one strip, little endian. sample_format: 1 unsigned, 2 signed, 3 floating point."""
     height, width = values.shape
-    data, bits = values.tobytes(), 8 * values.itemsize
+    data = values.tobytes()
+    bits = 8 * values.itemsize
     tags = {256: width, 257: height, 258: bits, 259: 1, 262: 1, 273: 8, 277: 1, 278: height}
     tags |= {279: len(data), 339: sample_format}
     entries = [struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items()]
@@ -152,7 +155,7 @@ def test_numbers_of_yaml_are_those_of_json(tmp_path, number):
 )
 def test_what_is_suspicious_is_told(tmp_path, changes, said):
     settings = SensorsSettings(rig(), str(written(tmp_path, **changes)))
-    session = open_sensors(settings, MODEL, 0)
+    session = open_sensors(settings, MODEL, seed=0)
     assert list(session.probes())
     told = [text for level, text in session.report.lines if level == "warning"]
     assert [text[: len(said or "")] for text in told] == ([said] if said else [])
@@ -161,7 +164,7 @@ def test_what_is_suspicious_is_told(tmp_path, changes, said):
 def test_a_camera_that_looks_past_the_workspace_is_told(tmp_path):
     past = dataclasses.replace(rig(), workspace=((3.0, 3.4), (0.0, 0.4), (0.0, 0.4)))
     path = written(tmp_path, label=None, object_class=None)
-    session = open_sensors(SensorsSettings(past, str(path)), MODEL, 0)
+    session = open_sensors(SensorsSettings(past, str(path)), MODEL, seed=0)
     assert list(session.probes())
     told = [text for level, text in session.report.lines if level == "warning"]
     assert [text[:40] for text in told] == ["camera: its rays miss the workspace; che"]

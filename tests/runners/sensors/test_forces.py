@@ -21,7 +21,7 @@ FORCES = ForceRig("/wrench")
 RIG = Rig(
     "pusher",
     "world",
-    ((0.2, 0.8), (-0.3, 0.3), (-0.1, 0.4)),
+    workspace=((0.2, 0.8), (-0.3, 0.3), (-0.1, 0.4)),
     boundary="none",
     hand=HAND,
     forces=(FORCES,),
@@ -54,12 +54,18 @@ def write_log(path, *, torque=True, settled=0.0, lacks=""):
 
     settled: seconds before which the sensor measures twice the hand's weight.
     """
-    fixed = {"transforms": [transform("hand", "ft", HAND_FROM_SENSOR, BEGIN)]}
+    fixed = {
+        "transforms": [transform("hand", "ft", parent_from_child=HAND_FROM_SENSOR, stamp=BEGIN)]
+    }
     sent = [("/tf_static", "tf2_msgs/TFMessage", fixed, BEGIN)]
     for tick in range(401):
         seconds = tick * 0.01
         stamp = BEGIN + round(seconds * SECOND)
-        moving = {"transforms": [transform("world", "hand", hand_pose(seconds), stamp)]}
+        moving = {
+            "transforms": [
+                transform("world", "hand", parent_from_child=hand_pose(seconds), stamp=stamp)
+            ]
+        }
         sent.append(("/tf", "tf2_msgs/TFMessage", moving, stamp))
         numbers = wrench(seconds) + WEIGHT * (2.0 if seconds < settled else 1.0)
         felt = {"force": xyz(*numbers[:3]), "torque": xyz(*(torque * numbers[3:]))}
@@ -181,5 +187,5 @@ def test_a_hand_alone_gives_free_space(log, tmp_path):
 
 def test_the_rig_to_start_from_is_read():
     values = yaml.safe_load((CONF / "session" / "rig" / "wrist_force.yaml").read_text())
-    rig = build_settings(Rig, values, "session.rig")
+    rig = build_settings(Rig, values, where="session.rig")
     assert rig.forces == (ForceRig("/wrist/wrench"),)

@@ -61,12 +61,12 @@ def test_small_patches_of_contact_beside_a_large_one_are_left_out(tmp_path, monk
 
 
 def cloud_rig(role):
-    return Rig("lidar", "world", RIG.workspace, clouds=(CloudRig("/cloud", role),))
+    return Rig("lidar", "world", workspace=RIG.workspace, clouds=(CloudRig("/cloud", role),))
 
 
 def cloud_log(path, points):
     """A log of one message of points (N, 3) in the world."""
-    fixed = {"transforms": [transform("world", "lidar", np.eye(4), BEGIN)]}
+    fixed = {"transforms": [transform("world", "lidar", parent_from_child=np.eye(4), stamp=BEGIN)]}
     cloud = ros2_cloud(points.astype(np.float32), BEGIN + 1)
     static = ("/tf_static", "tf2_msgs/TFMessage", fixed, BEGIN)
     write_ros2(path, [static, ("/cloud", "sensor_msgs/PointCloud2", cloud, BEGIN + 1)])
@@ -83,19 +83,22 @@ def test_points_of_a_cloud_that_are_not_connected_are_left_out(tmp_path, role):
     crumbs = CENTRE + [0.0, 0.1, 0.0] + 0.004 * np.eye(3)
     other = on_sphere(600, CENTRE - [0.0, 0.15, 0.0])
     points = np.concatenate([on_sphere(2000, CENTRE), crumbs, other])
-    log, rig = cloud_log(tmp_path / "log.mcap", points), cloud_rig(role)
-    session, (probe,), told = read(log, rig, 2 * RADIUS)
+    log = cloud_log(tmp_path / "log.mcap", points)
+    rig = cloud_rig(role)
+    session, (probe,), told = read(log, rig, diameter=2 * RADIUS)
     assert len(probe.new_points.known) > 500
     assert np.abs(heights(probe.new_points.known)).max() < 1e-6
     total = session.report.total()["/cloud"]
     assert 1 <= total.small <= 3
     assert total.far > 300  # a second body of the same size
     assert f"{total.small} in regions too small, {total.far} in regions too far" in told
-    kept = read(log, replace(rig, gate=GateRig(part=0.0)), 2 * RADIUS)[0].report.total()["/cloud"]
+    kept = read(log, replace(rig, gate=GateRig(part=0.0)), diameter=2 * RADIUS)[0].report.total()[
+        "/cloud"
+    ]
     assert (kept.small, kept.far) == (0, total.far + total.small)
     touches = CENTRE + RADIUS * np.concatenate([np.eye(3), -np.eye(3)[:1]])  # few, all kept
     few = cloud_log(tmp_path / "few.mcap", touches)
-    assert len(read(few, rig, 2 * RADIUS)[1][0].new_points.known) == 4
+    assert len(read(few, rig, diameter=2 * RADIUS)[1][0].new_points.known) == 4
 
 
 def test_ends_of_rays_that_are_too_far_away_give_no_free_space(tmp_path):

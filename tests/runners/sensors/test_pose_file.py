@@ -15,13 +15,13 @@ ROWS = "world_from_object: [[1,0,0,0.5],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
 def test_a_pose_is_read_as_it_was_written_and_replaced_if_that_is_wanted(tmp_path):
     path = beside(tmp_path / "a.b.mcap")
     assert path == beside(tmp_path / "a.b") == tmp_path / "a.b.pose.yaml"
-    write_pose(path, POSE, {"cost": 0.25, "search": {"spans": (1, 2)}})
+    write_pose(path, POSE, about={"cost": 0.25, "search": {"spans": (1, 2)}})
     with pytest.raises(RecordingError, match="exists; accepted: the name of a new file"):
-        write_pose(path, np.eye(4), {})
+        write_pose(path, np.eye(4), about={})
     np.testing.assert_allclose(read_pose(path), POSE, atol=1e-15)
     written = yaml.safe_load(path.read_text())
     assert (written["cost"], written["search"]) == (0.25, {"spans": [1, 2]})
-    write_pose(path, np.eye(4), {}, overwrite=True)
+    write_pose(path, np.eye(4), about={}, overwrite=True)
     np.testing.assert_array_equal(read_pose(path), np.eye(4))
 
 

@@ -58,7 +58,7 @@ def test_both_engines_touch_with_the_described_hand(kind, stick):
     settings = replace(ProbingSettings(), hand=stick, noise=0.0)
     if kind == "simulated":
         pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
-    session = open_probing(kind, box, "can", settings, 0)
+    session = open_probing(kind, box, configuration_name="can", settings=settings, seed=0)
     actions = session.offer(ActionSettings(choice="configuration"))
     face = apply(session.world_from_object, np.asarray(box.vertices))[:, 0].min()
     (probe,) = session.take(0, 1)  # y 0, z 0.12
@@ -77,8 +77,14 @@ def test_both_engines_touch_with_the_described_hand(kind, stick):
 
 
 def opened(hand):
-    settings = build_settings(ProbingSettings, {"hand": hand}, "session")
-    open_probing("kinematic", trimesh.creation.box((0.2, 0.3, 0.3)), "can", settings, 0)
+    settings = build_settings(ProbingSettings, {"hand": hand}, where="session")
+    open_probing(
+        "kinematic",
+        trimesh.creation.box((0.2, 0.3, 0.3)),
+        configuration_name="can",
+        settings=settings,
+        seed=0,
+    )
 
 
 @pytest.mark.parametrize(

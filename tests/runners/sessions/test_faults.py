@@ -31,19 +31,19 @@ def of_ball(free=None, seed=0, **settings):
     return Faults(
         FaultSettings(**settings),
         trimesh.creation.icosphere(subdivisions=4, radius=RADIUS),
-        pose,
-        free if free is not None else FreeVoxels(Lattice((0.0, 0.0, 0.0), SIDE)),
-        WORKSPACE,
-        seed,
+        world_from_object=pose,
+        free=free if free is not None else FreeVoxels(Lattice((0.0, 0.0, 0.0), SIDE)),
+        workspace=WORKSPACE,
+        seed=seed,
     )
 
 
-def reported(count, faults, steps=1):
+def reported(count, faults, *, steps=1):
     """True contacts all over the ball, (C, 3), and those reported of them, (C', 3)."""
     normals = directions(count)
     contacts = CENTRE + RADIUS * normals
     parts = zip(np.split(contacts, steps), np.split(normals, steps), strict=True)
-    found = [faults.reported(step, *part) for step, part in enumerate(parts)]
+    found = [faults.reported(step, at, normals_out=out) for step, (at, out) in enumerate(parts)]
     for places, normal in found:
         assert len(places) == len(normal)
         np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0)
@@ -133,7 +133,13 @@ def test_the_probed_mesh_is_smaller_about_the_same_centre():
 
 def kinematic(**faults):
     settings = ProbingSettings(faults=FaultSettings(**faults))
-    session = open_probing("kinematic", load_model("cracker_box", 1.5), "box", settings, 0)
+    session = open_probing(
+        "kinematic",
+        load_model("cracker_box", 1.5),
+        configuration_name="box",
+        settings=settings,
+        seed=0,
+    )
     return session, list(session.probes())
 
 

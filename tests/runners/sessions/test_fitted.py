@@ -33,8 +33,10 @@ MESHES = {
 }
 
 
-def probed(kind, mesh, settings=None):
-    session = open_probing(kind, mesh, FITTED, settings or ProbingSettings(), 0)
+def probed(kind, mesh, *, settings=None):
+    session = open_probing(
+        kind, mesh, configuration_name=FITTED, settings=settings or ProbingSettings(), seed=0
+    )
     probes = list(session.probes())
     session.close()
     return session, probes
@@ -69,21 +71,32 @@ def test_most_probes_touch_an_object_all_over(kind, name):
 
 def test_the_settings_of_free_voxels_hold():
     settings = ProbingSettings(free_resolution=0.02)
-    session = open_probing("kinematic", bracket(), FITTED, settings, 0)
-    assert session.free_resolution == 0.02
-    assert open_probing("kinematic", bracket(), "drill", ProbingSettings(), 0).free_resolution == (
-        0.025
+    session = open_probing(
+        "kinematic", bracket(), configuration_name=FITTED, settings=settings, seed=0
     )
+    assert session.free_resolution == 0.02
+    assert open_probing(
+        "kinematic", bracket(), configuration_name="drill", settings=ProbingSettings(), seed=0
+    ).free_resolution == (0.025)
 
 
 def test_probes_that_are_laid_out_for_another_size_are_a_warning():
-    small = ObjectModel("drill", load_model("drill", 1.0), 1.0, 0.001, "drill")
+    small = ObjectModel(
+        "drill", load_model("drill", 1.0), scale=1.0, epsilon=0.001, configuration="drill"
+    )
     with pytest.warns(MeshWarning, match="configuration drill is laid out .* paper's size"):
-        open_source("kinematic", ProbingSettings(), small, 0)
-    large = ObjectModel("drill", load_model("drill", 2.5), 2.5, 0.001, "drill", of_paper=True)
+        open_source("kinematic", ProbingSettings(), object_model=small, seed=0)
+    large = ObjectModel(
+        "drill",
+        load_model("drill", 2.5),
+        scale=2.5,
+        epsilon=0.001,
+        configuration="drill",
+        of_paper=True,
+    )
     with warnings.catch_warnings(action="error"):
-        open_source("kinematic", ProbingSettings(), large, 0)
-        open_source("kinematic", ProbingSettings(configuration=FITTED), small, 0)
+        open_source("kinematic", ProbingSettings(), object_model=large, seed=0)
+        open_source("kinematic", ProbingSettings(configuration=FITTED), object_model=small, seed=0)
 
 
 def test_the_hand_is_the_one_that_is_meant():
@@ -106,7 +119,8 @@ def test_a_mesh_of_ones_own_is_found_by_the_kinematic_hand(size, tmp_path):
     recording = read_recording(path)
     config = recording.start.config["session"]
     assert (config["object_resolution"], config["free_resolution"]) == (None, FREE_RESOLUTION)
-    hypotheses, truth = recording.hypotheses(19), recording.start.world_from_object
+    hypotheses = recording.hypotheses(19)
+    truth = recording.start.world_from_object
     points = trimesh.sample.sample_surface(mesh, 300, seed=0)[0]
     off = [
         np.linalg.norm(apply(truth, points) - apply(inverse(pose), points), axis=1).mean()

@@ -24,7 +24,14 @@ from tests.chsel.samples import REPOSITORY
 from tests.runners.sensors.sphere_log import RIG, SphereLog
 
 RECORDING = REPOSITORY / "tests" / "replays" / "mustard_svgd.mcap"
-MODEL = ObjectModel("spam_can", load_model("spam_can", 2.5), 2.5, 0.001, "can", of_paper=True)
+MODEL = ObjectModel(
+    "spam_can",
+    load_model("spam_can", 2.5),
+    scale=2.5,
+    epsilon=0.001,
+    configuration="can",
+    of_paper=True,
+)
 STARTED = {"start_contacts": 3, "start_probe": 2}
 
 
@@ -48,7 +55,9 @@ def test_a_source_of_every_kind_has_all_members_of_the_protocol(kind, tmp_path):
         pytest.skip("PyBullet is not installed")
     origin = KINDS[kind].object
     settings = session_settings(kind, values(kind, tmp_path) | STARTED)
-    source = open_source(kind, settings, None if origin is ObjectOrigin.RECORDED else MODEL, 0)
+    source = open_source(
+        kind, settings, object_model=None if origin is ObjectOrigin.RECORDED else MODEL, seed=0
+    )
     members = {*ProbeSource.__annotations__, "probes", "close"}
     assert members <= {name for name in members if hasattr(source, name)}
     assert isinstance(source.workspace, Workspace)
@@ -75,7 +84,10 @@ def test_a_source_of_every_kind_has_all_members_of_the_protocol(kind, tmp_path):
 
 def test_a_recorded_source_brings_its_object_and_its_start():
     source = open_source(
-        "recorded", session_settings("recorded", {"path": str(RECORDING)}), None, 0
+        "recorded",
+        session_settings("recorded", {"path": str(RECORDING)}),
+        object_model=None,
+        seed=0,
     )
     start = read_recording(RECORDING).start
     assert source.recorded.object == start.object == "mustard"

@@ -28,11 +28,11 @@ DEFAULT = ProbingSettings()
 TIP = 0.1123  # m: from the hand's origin to the end of its fingers
 
 
-def _run(name, settings=DEFAULT, seed=0):
+def _run(name, settings=DEFAULT, *, seed=0):
     scales = {"cracker_box": 1.5, "clamp": 5.0}
     of = CONFIGURATIONS[name].object
     mesh = load_model(of).apply_scale(scales.get(of, 2.5))
-    session = open_probing("kinematic", mesh, name, settings, seed)
+    session = open_probing("kinematic", mesh, configuration_name=name, settings=settings, seed=seed)
     return mesh, session, list(session.probes())
 
 
@@ -58,7 +58,7 @@ def test_a_wall_stops_the_finger_tip_to_a_micrometre_and_lets_it_go():
     wall = trimesh.creation.box((0.1, 2.0, 2.0))
     pose = np.eye(4)
     pose[0, 3] = 0.15
-    engine = KinematicEngine(wall, pose, DEFAULT, panda_hand())
+    engine = KinematicEngine(wall, pose, settings=DEFAULT, hand=panda_hand())
     for step in range(60):
         touch = engine.advance(np.array([X_REST + 0.002 * step, 0.0, 0.2]))
     assert touch.position[0] == pytest.approx(0.1 - TIP, abs=2e-6)
@@ -123,9 +123,16 @@ def test_a_seed_fixes_every_bit_and_another_one_does_not():
 
 
 def test_boundaries_are_a_slab_below_the_floor_and_a_shell_of_the_workspace():
-    free, mesh = {}, load_model("spam_can").apply_scale(2.5)
+    free = {}
+    mesh = load_model("spam_can").apply_scale(2.5)
     for boundary in ("floor_slab", "box_shell", "both"):
-        session = open_probing("kinematic", mesh, "can", replace(DEFAULT, boundary=boundary), 0)
+        session = open_probing(
+            "kinematic",
+            mesh,
+            configuration_name="can",
+            settings=replace(DEFAULT, boundary=boundary),
+            seed=0,
+        )
         free[boundary] = session.initial_points.free
     np.testing.assert_allclose(np.unique(free["floor_slab"][:, 2]), [-0.075, -0.05], atol=1e-12)
     # The can is 0.14 m x 0.25 m wide; the slab reaches 0.15 m further on each side.
@@ -137,7 +144,9 @@ def test_boundaries_are_a_slab_below_the_floor_and_a_shell_of_the_workspace():
 def test_no_free_voxel_of_the_shell_is_in_an_object_that_reaches_out_of_its_workspace():
     mesh = load_model("hammer").apply_scale(2.5)
     shell = replace(DEFAULT, boundary="box_shell")
-    session = open_probing("kinematic", mesh, "hammer_straight", shell, 0)
+    session = open_probing(
+        "kinematic", mesh, configuration_name="hammer_straight", settings=shell, seed=0
+    )
     assert apply(session.world_from_object, np.asarray(mesh.vertices))[:, 0].max() > 0.5
     every = box_shell(Lattice(session.workspace.lower, session.free_resolution), session.workspace)
     distance, _ = mesh_sdf(mesh, apply(inverse(session.world_from_object), every))
@@ -185,7 +194,8 @@ def test_a_configuration_that_is_not_accepted_is_an_error_that_lists_those_that_
 
 
 def test_the_hammer_has_a_larger_workspace_but_in_the_paper():
-    hammer, settings = find_configuration("hammer"), ProbingSettings()
+    hammer = find_configuration("hammer")
+    settings = ProbingSettings()
     assert choose_workspace(hammer, in_preset(settings, "reference")).upper == (0.5, 0.5, 0.4)
     assert choose_workspace(hammer, in_preset(settings, "paper")).upper == (0.5, 0.3, 0.625)
 

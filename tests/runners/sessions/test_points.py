@@ -9,7 +9,9 @@ from chsel.problem.sdf_grid import object_grid
 from runners.objects.loader import ObjectModel
 from runners.sessions.points import PointsSettings, PointsSource, read_points
 
-BOX = ObjectModel("box", trimesh.creation.box((0.03, 0.04, 0.12)), 1.0, 0.001, "box")
+BOX = ObjectModel(
+    "box", trimesh.creation.box((0.03, 0.04, 0.12)), scale=1.0, epsilon=0.001, configuration="box"
+)
 SURFACE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.2, 0.0]])
 
 
@@ -19,7 +21,7 @@ def npz(folder, **arrays):
     return path
 
 
-def text(folder, content, name="points.csv"):
+def text(folder, content, *, name="points.csv"):
     path = folder / name
     path.write_text(content)
     return path
@@ -117,11 +119,11 @@ def test_vertices_of_meshes_and_clouds_are_surface_points(tmp_path, suffix):
 
 def test_vertices_beside_the_faces_are_points_too(tmp_path):
     off = "OFF\n5 1 0\n0 0 0\n1 0 0\n0 1 0\n0 0 0\n{} 2 2\n3 0 1 2\n"
-    found = read_points(text(tmp_path, off.format("2"), "points.off")).at(0).known
+    found = read_points(text(tmp_path, off.format("2"), name="points.off")).at(0).known
     expected = [[0, 0, 0], [0, 0, 0], [0, 1, 0], [1, 0, 0], [2, 2, 2]]
     assert sorted(found.tolist()) == expected
     with pytest.raises(PointsError, match=r"surface\[4\] is not finite"):
-        read_points(text(tmp_path, off.format("nan"), "points.off"))
+        read_points(text(tmp_path, off.format("nan"), name="points.off"))
 
 
 @pytest.mark.parametrize(

@@ -78,16 +78,19 @@ def in_order(points):
 
 def test_a_probe_that_is_taken_first_shows_nearly_all_that_it_swept():
     mesh = load_model("mustard").apply_scale(2.5)
-    session = open_probing("kinematic", mesh, "mustard", ProbingSettings(), 0)
+    session = open_probing(
+        "kinematic", mesh, configuration_name="mustard", settings=ProbingSettings(), seed=0
+    )
     probes, swept = [], []
     for probe in session.probes():
-        path, lattice = np.array(session._gripper.path), session._voxels.lattice
+        path = np.array(session._gripper.path)
+        lattice = session._voxels.lattice
         probes.append(probe)
-        swept.append(swept_voxels(lattice, session._interior, path))
+        swept.append(swept_voxels(lattice, session._interior, positions=path))
         if len(probes) == 4:
             break
     initial = session.initial_points.free
-    every = RecordedActions(probes, session.hand, lattice, depth=0.010)
+    every = RecordedActions(probes, session.hand, lattice=lattice, depth=0.010)
     shown = np.concatenate([initial, every.take(0, 3).new_points.free])
     new, true, initially = (
         set(map(tuple, np.rint(points / 0.0125).astype(int).tolist()))
@@ -105,7 +108,7 @@ def test_what_cannot_be_steered_is_an_error(tmp_path):
     lattice = Lattice(session.workspace.lower, session.free_resolution)
     short = [replace(probe, gripper_path=probe.gripper_path[:1]) for probe in probes]
     with pytest.raises(SessionError, match="probe 0 has 1 poses of the hand; accepted"):
-        RecordedActions(short, session.hand, lattice, depth=0.0)
+        RecordedActions(short, session.hand, lattice=lattice, depth=0.0)
     still = [replace(probe, gripper_path=probe.gripper_path[[-1, -1]]) for probe in probes]
     with pytest.raises(SessionError, match=r"no probe goes 0.01 m along the z axis of the hand"):
-        RecordedActions(still, session.hand, lattice, depth=0.0)
+        RecordedActions(still, session.hand, lattice=lattice, depth=0.0)

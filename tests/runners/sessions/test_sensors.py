@@ -48,7 +48,7 @@ def events(log):
     return list(open_log(log).probes())
 
 
-def open_log(path, rig=RIG, seed=0, **changes):
+def open_log(path, rig=RIG, *, seed=0, **changes):
     return SensorsSource(SensorsSettings(rig, str(path), **changes), seed)
 
 
@@ -146,7 +146,8 @@ def test_the_seed_chooses_among_contact_pixels_and_changes_nothing_else(events, 
     session = open_log(log)
     again = probes(session.probes())[0]
     assert session.report.total()["pad"].contacts == 50
-    other, first = probes(open_log(log, seed=1).probes())[0], probes(events)[0]
+    other = probes(open_log(log, seed=1).probes())[0]
+    first = probes(events)[0]
     assert again.new_points.digest == first.new_points.digest
     np.testing.assert_array_equal(other.new_points.free, first.new_points.free)
     assert len(other.contacts) == 50
@@ -394,18 +395,18 @@ def test_a_pose_beside_the_log_is_the_true_one(tmp_path):
     assert open_log(log).world_from_object is None
     pose = np.eye(4)
     pose[:3, 3] = CENTRE
-    write_pose(beside(log), pose, {})
+    write_pose(beside(log), pose, about={})
     session = open_log(log)
     np.testing.assert_array_equal(session.world_from_object, pose)
     events = list(session.probes())
     assert "the true pose is that of log.pose.yaml" in lines(events, "info")
     assert "workspace" not in lines(events)
     pose[:3, 3] *= 1000.0
-    write_pose(beside(log), pose, {}, overwrite=True)
+    write_pose(beside(log), pose, about={}, overwrite=True)
     told = lines(open_log(log).probes())
     assert "pose of log.pose.yaml is 1e+03 m outside of the workspace; check its unit" in told
     pose[:3, 3] = CENTRE
-    write_pose(beside(log), pose, {}, overwrite=True)
+    write_pose(beside(log), pose, about={}, overwrite=True)
     assert open_log(log, pose="none").world_from_object is None
     with pytest.raises(SessionError, match=r"other.yaml: cannot be read"):
         open_log(log, pose=str(tmp_path / "other.yaml"))

@@ -55,11 +55,15 @@ def _mesh(configuration_name):
 @pytest.fixture(scope="module", params=list(CONFIGURATIONS))
 def pair(request):
     mesh = _mesh(request.param)
-    simulated = open_probing("simulated", mesh, request.param, ProbingSettings(), 0)
-    kinematic = open_probing("kinematic", mesh, request.param, ProbingSettings(), 0)
+    simulated = open_probing(
+        "simulated", mesh, configuration_name=request.param, settings=ProbingSettings(), seed=0
+    )
+    kinematic = open_probing(
+        "kinematic", mesh, configuration_name=request.param, settings=ProbingSettings(), seed=0
+    )
     both = list(simulated.probes()), list(kinematic.probes())
     simulated.close()
-    return _Pair(mesh, simulated.world_from_object, *both)
+    return _Pair(mesh, simulated.world_from_object, simulated=both[0], kinematic=both[1])
 
 
 def test_contacts_agree_with_plain_geometry_to_3_mm(pair):
@@ -67,7 +71,7 @@ def test_contacts_agree_with_plain_geometry_to_3_mm(pair):
     for simulated, kinematic in zip(pair.simulated, pair.kinematic, strict=True):
         assert simulated.outcome == kinematic.outcome
         for contact in simulated.contacts:
-            patch = np.concatenate([kinematic.contacts, _touching(pair, kinematic, contact)])
+            patch = np.concatenate([kinematic.contacts, _touching(pair, kinematic, near=contact)])
             assert _distances(contact, patch).min() < AGREEMENT
             distances.append(_distances(contact, kinematic.contacts).min())
     # Where faces lie nearly flat on one another, one engine's point can be anywhere in the patch
@@ -76,7 +80,7 @@ def test_contacts_agree_with_plain_geometry_to_3_mm(pair):
     assert max(distances) < 0.010
 
 
-def _touching(pair, probe, near):
+def _touching(pair, probe, *, near):
     """Where on the object (N, 3) the hand of a probe, at its furthest, all but touches it."""
     ends = probe.gripper_path[:, :3, 3]
     surface = panda_hand().surface_points(0.001) + ends[np.argmax(ends[:, 0])]
@@ -128,7 +132,9 @@ def test_a_seed_gives_the_same_bytes_in_every_process():
 
 def test_contacts_can_be_with_the_convex_parts(capfd):
     settings = ProbingSettings(collision_mesh="vhacd")
-    session = open_probing("simulated", _mesh("can"), "can", settings, 0)
+    session = open_probing(
+        "simulated", _mesh("can"), configuration_name="can", settings=settings, seed=0
+    )
     assert len(next(session.probes()).contacts) >= 1
     session.close()
     assert capfd.readouterr().out == ""  # the decomposition is talkative
@@ -137,4 +143,6 @@ def test_contacts_can_be_with_the_convex_parts(capfd):
 def test_without_pybullet_the_error_names_the_other_session(monkeypatch):
     monkeypatch.setitem(sys.modules, "pybullet", None)
     with pytest.raises(SessionError, match="session=kinematic"):
-        open_probing("simulated", _mesh("can"), "can", ProbingSettings(), 0)
+        open_probing(
+            "simulated", _mesh("can"), configuration_name="can", settings=ProbingSettings(), seed=0
+        )

@@ -21,7 +21,9 @@ from runners.sessions.probing_settings import ProbingSettings
 def session(request):
     if request.param == "simulated":
         pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
-    opened = open_probing(request.param, _mustard(), "mustard", ProbingSettings(), 0)
+    opened = open_probing(
+        request.param, _mustard(), configuration_name="mustard", settings=ProbingSettings(), seed=0
+    )
     yield opened
     opened.close()
 
@@ -31,16 +33,20 @@ def _mustard():
 
 
 def test_a_probe_goes_straight_along_the_hand_and_meets_what_is_forecast(session):
-    mesh, actions = _mustard(), session.offer(ActionSettings())
+    mesh = _mustard()
+    actions = session.offer(ActionSettings())
     chosen = np.linspace(0, len(actions) - 1, 9).astype(int).tolist()
     taken = [(action, next(session.take(step, action))) for step, action in enumerate(chosen)]
     object_from_world = inverse(session.world_from_object)
     belief = WeightedPoses(object_from_world[None], np.ones(1))
     sdf = SdfGrid.from_mesh(mesh, 0.005, padding=0.02)
-    first = first_contacts(sdf, belief, actions, session.hand)
-    agreed, late, off = 0, [], []
+    first = first_contacts(sdf, belief, actions=actions, hand=session.hand)
+    agreed = 0
+    late = []
+    off = []
     for step, (action, probe) in enumerate(taken):
-        start, path = actions.world_from_hand[action], probe.gripper_path
+        start = actions.world_from_hand[action]
+        path = probe.gripper_path
         assert probe.step == step
         assert (path[:, :3, :3] == start[:3, :3]).all()
         way = path[:, :3, 3] - start[:3, 3]
@@ -80,9 +86,13 @@ def test_an_action_is_taken_once(session):
 
 
 def test_the_grid_as_actions_has_the_outcomes_of_the_grid():
-    paper = open_probing("kinematic", _mustard(), "mustard", ProbingSettings(), 0)
+    paper = open_probing(
+        "kinematic", _mustard(), configuration_name="mustard", settings=ProbingSettings(), seed=0
+    )
     grid = list(islice(paper.probes(), 3))
-    session = open_probing("kinematic", _mustard(), "mustard", ProbingSettings(), 0)
+    session = open_probing(
+        "kinematic", _mustard(), configuration_name="mustard", settings=ProbingSettings(), seed=0
+    )
     actions = session.offer(ActionSettings(choice="configuration"))
     assert len(actions) == session.count
     np.testing.assert_allclose(actions.length, 0.3)

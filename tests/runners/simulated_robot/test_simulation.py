@@ -25,7 +25,7 @@ pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only
 CONFIGURATION = CABINET_CONFIGURATIONS["cabinet_mustard"]
 MESH = load_model("mustard")
 SEED = 3
-SMALL = RobotSettings(2, CameraSettings(width=160, rate=1.0), BubbleSettings(rate=5.0))
+SMALL = RobotSettings(2, CameraSettings(width=160, rate=1.0), bubbles=BubbleSettings(rate=5.0))
 # One probe that touches nothing, in which little is seen.
 TINY = replace(SMALL, probes=1, push_steps=1, standing=0.2, dwell=0.1, drop=0.0)
 
@@ -45,9 +45,9 @@ class Log:
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
     path = tmp_path_factory.mktemp("simulated") / "small.mcap"
-    truth = simulate_log(path, CONFIGURATION, MESH, SEED, SMALL)
+    truth = simulate_log(path, CONFIGURATION, mesh=MESH, seed=SEED, settings=SMALL)
     raw = RawLog(path)
-    return Log(path, truth, list(raw.messages(raw.topics)))
+    return Log(path, truth, messages=list(raw.messages(raw.topics)))
 
 
 def test_messages_are_logged_a_little_later_than_they_are_sent(log):
@@ -107,7 +107,7 @@ def test_the_outer_camera_sees_the_cabinet_where_it_is(log):
 def test_the_same_arguments_give_the_same_bytes(tmp_path):
     paths = [tmp_path / name for name in ("one.mcap", "two.mcap", "other.mcap")]
     for path, seed in zip(paths, (SEED, SEED, SEED + 1), strict=True):
-        simulate_log(path, CONFIGURATION, MESH, seed, TINY)
+        simulate_log(path, CONFIGURATION, mesh=MESH, seed=seed, settings=TINY)
     one, two, other = (path.read_bytes() for path in paths)
     assert one == two
     assert one != other

@@ -13,20 +13,25 @@ SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND
 
 
-def received(topic, time, stamp):
+def received(topic, time, *, stamp):
     """A message at seconds since BEGIN."""
     sent = None if stamp is None else BEGIN + round(stamp * SECOND)
-    return Received(topic, BEGIN + round(time * SECOND), sent, "x")
+    return Received(topic, BEGIN + round(time * SECOND), stamp=sent, content="x")
 
 
 def gathered(offsets, rig=None):
     """Eleven messages a topic, whose stamps are off by so many seconds and some milliseconds."""
-    clocks, random = Clocks(rig or ClockRig()), np.random.default_rng(0)
-    static = TransformMessage("a", "b", np.eye(4), static=True)  # of long ago, as it may be
-    clocks.add(Received("/tf_static", BEGIN + 10 * SECOND, BEGIN - 9999 * SECOND, static))
+    clocks = Clocks(rig or ClockRig())
+    random = np.random.default_rng(0)
+    static = TransformMessage(
+        "a", "b", parent_from_child=np.eye(4), static=True
+    )  # of long ago, as it may be
+    clocks.add(
+        Received("/tf_static", BEGIN + 10 * SECOND, stamp=BEGIN - 9999 * SECOND, content=static)
+    )
     for time in range(11):
         for topic, offset in offsets.items():
-            clocks.add(received(topic, time, time + offset - 0.01 * random.random()))
+            clocks.add(received(topic, time, stamp=time + offset - 0.01 * random.random()))
     return clocks
 
 
@@ -60,10 +65,10 @@ def test_clocks_that_depart_are_shifted(offsets, shifts, said):
     assert "".join(correction.warnings) == said
     typical = sorted(offsets.values())[1]
     for topic, offset in offsets.items():
-        stamped = correction.time(received(topic, 5.0, 5.0 + offset)) - BEGIN
+        stamped = correction.time(received(topic, 5.0, stamp=5.0 + offset)) - BEGIN
         shifted = typical if topic in shifts else offset
         assert stamped / SECOND == pytest.approx(5.0 + shifted, abs=0.02)
-    unstamped = correction.time(received("/unknown", 7.0, None)) - BEGIN
+    unstamped = correction.time(received("/unknown", 7.0, stamp=None)) - BEGIN
     assert unstamped / SECOND == pytest.approx(7.0 + typical * (abs(typical) > 1.0), abs=0.02)
 
 
@@ -81,22 +86,25 @@ def test_clocks_that_depart_are_shifted(offsets, shifts, said):
 def test_a_lasting_step_of_a_clock_below_the_limit_is_said(offsets, step):
     clocks = Clocks(ClockRig())
     for number, offset in enumerate(offsets):
-        clocks.add(received("/camera", number, number + offset))
+        clocks.add(received("/camera", number, stamp=number + offset))
     correction = clocks.correction()
     said = [] if step is None else [f"stamps on /camera jump by {step} s against the log's clock"]
     assert [text.split(", which")[0] for text in correction.warnings] == said
-    assert correction.time(received("/camera", 11.0, 11.6)) == BEGIN + round(11.6 * SECOND)
+    assert correction.time(received("/camera", 11.0, stamp=11.6)) == BEGIN + round(11.6 * SECOND)
 
 
 def test_the_logs_times_count_for_all_if_told_so():
     correction = gathered({"/a": 90.0, "/b": 0.0}, ClockRig(stamp="log")).correction()
-    assert correction.time(received("/a", 3.0, 93.0)) == BEGIN + 3 * SECOND
+    assert correction.time(received("/a", 3.0, stamp=93.0)) == BEGIN + 3 * SECOND
 
 
 def test_messages_come_in_the_order_of_their_times_if_they_are_not_too_late():
     stamps = [3, 1, 2, 9, 5, 4, 30, 0]  # the last one comes long after its place
     logged = [0, 0, 0, 1, 1, 1, 3 * SLACK, 3 * SLACK]
-    messages = [Received("/t", *times, "") for times in zip(logged, stamps, strict=True)]
+    messages = [
+        Received("/t", times[0], stamp=times[1], content="")
+        for times in zip(logged, stamps, strict=True)
+    ]
     got = [time for time, _ in in_time_order(messages, lambda message: message.stamp or 0)]
     assert got == [1, 2, 3, 4, 5, 9, 0, 30]
 
@@ -105,7 +113,7 @@ def spans(*texts):
     """Windows of markers at times 10, 20, ... in a log from 0 to 100, and the warnings."""
     warnings = LogWarnings()
     markers = [(10 * (index + 1), text) for index, text in enumerate(texts)]
-    windows = marked_windows(reversed(markers), 0, 100, warnings)
+    windows = marked_windows(reversed(markers), 0, last=100, warnings=warnings)
     found = [(w.step, w.opens, w.begin, w.end, w.closes) for w in windows]
     return found, [text for _, text in warnings.lines()]
 

@@ -33,18 +33,18 @@ def moved(x, y, z):
     return pose
 
 
-CAMERA = PinholeCamera(5, 3, 400.0, 410.0, 2.0, 1.0)
+CAMERA = PinholeCamera(5, 3, fx=400.0, fy=410.0, cx=2.0, cy=1.0)
 CONTENTS: dict[str, Content] = {  # of step 3
-    "/tf_static": TransformMessage("base", "camera", moved(0, 0, 1), static=True),
-    "/tf": TransformMessage("world", "base", moved(3, 0, 0)),
+    "/tf_static": TransformMessage("base", "camera", parent_from_child=moved(0, 0, 1), static=True),
+    "/tf": TransformMessage("world", "base", parent_from_child=moved(3, 0, 0)),
     "/depth": ImageMessage("camera", depth(3)),
     "/compressed": ImageMessage("camera", depth(3)),
     "/quantised": ImageMessage("camera", (100.0 / (depth(3) + 20.0)).astype(np.float32)),
     "/info": CameraInfoMessage(CAMERA, rectified=CAMERA),
-    "/pose": TransformMessage("base", "", TURNED),
+    "/pose": TransformMessage("base", "", parent_from_child=TURNED),
     "/poses": CloudMessage("base", np.array([[1.0, 2, 3], [1, 2, 3]])),
     "/point": CloudMessage("base", np.array([[1.0, 0, 2]])),
-    "/wrench": WrenchMessage("hand", np.array([1.0, 2, -3]), np.array([0.25, 0, 0.5])),
+    "/wrench": WrenchMessage("hand", np.array([1.0, 2, -3]), torque=np.array([0.25, 0, 0.5])),
     "/joints": {"elbow": 0.5, "wrist": -0.25},
     "/cloud": CloudMessage("lidar", np.array([[0.0, 1, 2], [3, 4, 5]])),
     "/probe": "begin 3",
@@ -79,7 +79,8 @@ def assert_same(found, expected):
 
 @pytest.mark.parametrize("foxglove", ["", "packed", "rows"])
 def test_messages_of_both_encodings_are_decoded(tmp_path, foxglove):
-    path, topics = tmp_path / "log.mcap", CONTENTS.keys()
+    path = tmp_path / "log.mcap"
+    topics = CONTENTS.keys()
     write_ros2(path, ros2_sent(4))
     if foxglove:
         path = in_foxgloves_messages(path, tmp_path / "again.mcap", packed=foxglove == "packed")
@@ -96,7 +97,7 @@ def test_broken_messages_are_counted_with_their_topic(tmp_path):
     good = ros2_sent(1)
     ages_ago = {"stamp": {"sec": -1, "nanosec": 0}, "frame_id": "a"}
     images = [{"encoding": "rgb8"}, {"height": 2**31}, {"header": ages_ago}]
-    usual = image("camera", depth(), 5)
+    usual = image("camera", depth(), stamp=5)
     changed = [("/depth", "sensor_msgs/Image", {**usual, **change}, 9) for change in images]
     picture = {"header": {}, "format": "png", "data": png(depth())[:60]}
     changed.append(("/compressed", "sensor_msgs/CompressedImage", picture, 9))
@@ -116,12 +117,15 @@ def test_broken_messages_are_counted_with_their_topic(tmp_path):
 
 
 def test_of_several_transforms_only_the_broken_one_is_left_out(tmp_path):
-    parts = [transform("base", name, moved(x, 0, 0), 5) for name, x in (("a", np.nan), ("b", 1))]
+    parts = [
+        transform("base", name, parent_from_child=moved(x, 0, 0), stamp=5)
+        for name, x in (("a", np.nan), ("b", 1))
+    ]
     sent = [("/tf", "tf2_msgs/TFMessage", {"transforms": parts}, 9)]
     write_ros2(tmp_path / "log.mcap", sent)
     log = RawLog(tmp_path / "log.mcap")
     (received,) = log.messages(["/tf"])
-    assert_same(received.content, TransformMessage("base", "b", moved(1, 0, 0)))
+    assert_same(received.content, TransformMessage("base", "b", parent_from_child=moved(1, 0, 0)))
     assert list(log.faults.values()) == [1]
 
 
@@ -139,9 +143,9 @@ def test_intrinsics_are_those_of_the_pixels_that_are_sent(tmp_path):
         "roi": {"x_offset": 100, "y_offset": 40, "width": 320, "height": 240},
     }
     write_ros2(tmp_path / "log.mcap", [(topic, kind, sent, log_time)])
-    camera = PinholeCamera(160, 60, 200.0, 102.5, 110.0, 50.0)
+    camera = PinholeCamera(160, 60, fx=200.0, fy=102.5, cx=110.0, cy=50.0)
     content = by_topic(tmp_path / "log.mcap")["/info"].content
-    rectified = PinholeCamera(160, 60, 400.0, 205.0, 100.0, 40.0)
+    rectified = PinholeCamera(160, 60, fx=400.0, fy=205.0, cx=100.0, cy=40.0)
     assert content == CameraInfoMessage(camera, distorted=True, rectified=rectified)
 
 
@@ -177,7 +181,7 @@ def test_a_little_skew_of_a_driver_is_left_out(tmp_path):
     )
     assert by_topic(tmp_path / "log.mcap")["/info"].content == CameraInfoMessage(CAMERA)
     with pytest.raises(SettingError, match="not a pinhole camera's matrix"):
-        PinholeCamera.of_matrix(np.reshape(k, (3, 3)), 5, 3)
+        PinholeCamera.of_matrix(np.reshape(k, (3, 3)), 5, height=3)
 
 
 def test_a_rectified_matrix_that_is_none_does_not_matter(tmp_path):
@@ -196,24 +200,28 @@ VALUES = np.random.default_rng(0).integers(0, 2**16, (4, 7)).astype(np.uint16)
 def test_rows_of_pixels(encoding, kind, big_endian, padding):
     stored = VALUES.astype((">" if big_endian else "<") + kind)
     rows = np.pad(stored.view(np.uint8).reshape(4, -1), ((0, 0), (0, padding)))
-    found = pixel_rows(rows.tobytes(), encoding, (7, 4), rows.shape[1], big_endian=big_endian)
+    found = pixel_rows(
+        rows.tobytes(), encoding, size=(7, 4), step=rows.shape[1], big_endian=big_endian
+    )
     assert found.dtype == np.dtype(kind)
     np.testing.assert_array_equal(found, VALUES)
     for size, step in (((7, 5), rows.shape[1]), ((7, 3), 0)):
         with pytest.raises(UnusableMessage, match=f"cannot have {rows.size} bytes"):
-            pixel_rows(rows.tobytes(), encoding, size, step)
+            pixel_rows(rows.tobytes(), encoding, size=size, step=step)
 
 
 @pytest.mark.parametrize("step", [0, 1280, 2**32 - 1])
 def test_rows_without_gaps_need_no_length(step):
-    np.testing.assert_array_equal(pixel_rows(VALUES.tobytes(), "16UC1", (7, 4), step), VALUES)
+    np.testing.assert_array_equal(
+        pixel_rows(VALUES.tobytes(), "16UC1", size=(7, 4), step=step), VALUES
+    )
     points = np.arange(18.0).reshape(6, 3)
     fields = {name: (8 * k, 8) for k, name in enumerate("xyz")}
     for size in ((6, 1), (3, 2)):
-        found = packed_points(points.tobytes(), fields, 24, size=size, row=step)
+        found = packed_points(points.tobytes(), fields, stride=24, size=size, row=step)
         np.testing.assert_array_equal(found, points)
     with pytest.raises(UnusableMessage, match="cannot have 144 bytes"):
-        packed_points(points.tobytes(), fields, 24, size=(5, 1), row=step)
+        packed_points(points.tobytes(), fields, stride=24, size=(5, 1), row=step)
 
 
 @pytest.mark.parametrize(
@@ -237,7 +245,8 @@ def test_compressed_depth_is_that_of_image_transport():
     whole = struct.pack("<iff", 0, 0.0, 0.0) + png(VALUES)
     np.testing.assert_array_equal(compressed_pixels(whole, "16UC1; compressedDepth png"), VALUES)
     depth = np.array([[0.5, 2.0], [8.0, np.nan]])  # as the sender quantises: n = a / depth + b
-    scale, offset = 100.0 * 101.0, 1.0 - 100.0 * 101.0 / 10.0
+    scale = 100.0 * 101.0
+    offset = 1.0 - 100.0 * 101.0 / 10.0
     numbers = np.where(np.isnan(depth), 0, np.rint(scale / np.nan_to_num(depth, nan=1.0) + offset))
     data = struct.pack("<iff", 1, scale, offset) + png(numbers.astype(np.uint16))
     found = compressed_pixels(data, "32FC1; compressedDepth")
@@ -259,11 +268,11 @@ def test_points_of_several_rows_with_gaps(order):
     rows = np.pad(packed.view(np.uint8).reshape(2, 90), ((0, 0), (0, 40)))
     fields = {"x": (8, 8), "intensity": (24, 4), "y": (16, 7), "z": (0, 8)}
     big = order == ">"
-    found = packed_points(rows.tobytes(), fields, 30, size=(3, 2), row=130, big_endian=big)
+    found = packed_points(rows.tobytes(), fields, stride=30, size=(3, 2), row=130, big_endian=big)
     np.testing.assert_array_equal(found, points.reshape(-1, 3))
     for size in ((5, 2), (3, 3)):
         with pytest.raises(UnusableMessage, match="cannot have 260 bytes"):
-            packed_points(rows.tobytes(), fields, 30, size=size, row=130)
+            packed_points(rows.tobytes(), fields, stride=30, size=size, row=130)
     with pytest.raises(UnusableMessage, match="has no field z of float32 or float64"):
-        packed_points(b"", {"x": (0, 7), "y": (4, 7), "z": (0, 5)}, 30, size=(0, 1), row=0)
-    assert packed_points(b"", fields, 30, size=(0, 1), row=0).shape == (0, 3)
+        packed_points(b"", {"x": (0, 7), "y": (4, 7), "z": (0, 5)}, stride=30, size=(0, 1), row=0)
+    assert packed_points(b"", fields, stride=30, size=(0, 1), row=0).shape == (0, 3)

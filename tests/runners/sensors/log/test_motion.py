@@ -27,7 +27,7 @@ THERE = np.array([0.2, 0.0, 0.3])
 ASIDE = np.array([0.3, 0.2, 0.1])
 
 
-def straight(start=THERE, count=101, begin=0.0):
+def straight(start=THERE, count=101, *, begin=0.0):
     """Seconds and positions of a hand that goes 0.1 m along x in 2 s."""
     return [
         (begin + 0.02 * n, np.add(start, [0.1 * n / (count - 1), 0.0, 0.0])) for n in range(count)
@@ -41,14 +41,14 @@ def moved(samples, by):
     return [(seconds, place + by) for seconds, place in samples]
 
 
-def swept(path, samples, topic="/tf", stamps=None):
+def swept(path, samples, *, topic="/tf", stamps=None):
     """Free voxels of samples, positions or poses, and what was told."""
     sent = []
     for seconds, place in samples:
         pose = place if np.ndim(place) == 2 else compose(np.eye(3), np.array(place, dtype=float))
         log_time = BEGIN + round(seconds * SECOND)
         stamp = log_time if stamps is None else BEGIN + round(stamps(seconds) * SECOND)
-        moving = transform("base", "tool0", pose, stamp)
+        moving = transform("base", "tool0", parent_from_child=pose, stamp=stamp)
         if topic == "/tf":
             sent.append((topic, "tf2_msgs/TFMessage", {"transforms": [moving]}, log_time))
         else:
@@ -158,7 +158,7 @@ def test_a_hand_that_taps_keeps_its_turning_points(rate, frequency, amplitude, p
         away = np.abs(places[one] - places[other])
         return np.stack([away, np.zeros_like(away)], axis=1)
 
-    motion = check_motion(np.rint(seconds * SECOND).astype(np.int64), distances, LIMITS)
+    motion = check_motion(np.rint(seconds * SECOND).astype(np.int64), distances, limits=LIMITS)
     assert motion.kept.all()
     assert not motion.jumps.any()
 
@@ -186,7 +186,9 @@ def test_two_topics_of_one_transform_are_both_named(tmp_path):
     for topic, samples in (("/tf_arm", WAY), ("/tf_mocap", moved(WAY, ASIDE))):
         for seconds, place in samples:
             time = BEGIN + round(seconds * SECOND)
-            message = transform("base", "tool0", compose(np.eye(3), place), time)
+            message = transform(
+                "base", "tool0", parent_from_child=compose(np.eye(3), place), stamp=time
+            )
             sent.append((topic, "geometry_msgs/TransformStamped", message, time))
     write_ros2(tmp_path / "log.mcap", sorted(sent, key=lambda one: one[3]))
     with pytest.raises(SessionError, match="on /tf_arm and /tf_mocap, alternates between places"):
@@ -198,7 +200,7 @@ def history(*positions, sliding=("finger",), every=0.02):
     joints = JointHistory(["finger"], sliding)
     for index, value in enumerate(positions):
         time = round(index * every * SECOND)
-        joints.add(Received("/joint_states", time, None, ""), {"finger": value})
+        joints.add(Received("/joint_states", time, stamp=None, content=""), {"finger": value})
     return joints, joints.settle(ClockCorrection(), LIMITS)
 
 
@@ -239,10 +241,14 @@ def test_a_hand_whose_joints_are_unknown_sweeps_nothing(tmp_path):
         sent = []
         for seconds, place in WAY:
             time = BEGIN + round(seconds * SECOND)
-            moving = transform("base", "tool0", compose(np.eye(3), place), time)
+            moving = transform(
+                "base", "tool0", parent_from_child=compose(np.eye(3), place), stamp=time
+            )
             sent.append(("/tf", "tf2_msgs/TFMessage", {"transforms": [moving]}, time))
             for number, value in enumerate((0.0, *others)):
-                states = joint_state(["wheel", "finger"], [np.nan, value], time + number * 10**7)
+                states = joint_state(
+                    ["wheel", "finger"], [np.nan, value], stamp=time + number * 10**7
+                )
                 sent.append(("/joint_states", "sensor_msgs/JointState", states, time))
         write_ros2(tmp_path / "log.mcap", sent)
         session, probes, told[name] = read(tmp_path / "log.mcap", replace(RIG, hand=hand))
@@ -260,7 +266,7 @@ def test_a_value_that_is_nan_leaves_the_joint_where_it_was():
     joints = JointHistory(["finger", "wrist"])
     for time, finger in ((0, 0.04), (SECOND, float("nan"))):
         positions = {"wheel": float("nan"), "finger": finger, "wrist": time / SECOND}
-        joints.add(Received("/joints", time, None, ""), positions)
+        joints.add(Received("/joints", time, stamp=None, content=""), positions)
     assert joints.settle(ClockCorrection(), LIMITS) == []
     assert joints.during(0, 2 * SECOND)[-1][1] == {"finger": 0.04, "wrist": 1.0}
     said = "/joints: joint finger is not a finite number; it counts as unmoved"

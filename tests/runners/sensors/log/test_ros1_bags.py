@@ -51,7 +51,7 @@ def test_a_bag_is_converted_as_the_page_says(tmp_path):
     log = RawLog(tmp_path / "LOG")
     content = {received.topic: received.content for received in log.messages(log.topics)}
     assert not log.faults
-    one, other = (PinholeCamera(5, 3, f, f, 2.0, 1.0) for f in (4.0, 3.0))
+    one, other = (PinholeCamera(5, 3, fx=f, fy=f, cx=2.0, cy=1.0) for f in (4.0, 3.0))
     assert content["/info"] == CameraInfoMessage(one, rectified=other)
     values = np.arange(30, dtype=np.uint8).view("<u2").reshape(3, 5)
     np.testing.assert_array_equal(content["/depth"].values, values)
