@@ -87,8 +87,6 @@ def trust_in(
     Raises PoseError if there is no hypothesis or the best is not finite, and SettingError for noise
     that is not above 0.
     """
-    from scipy.sparse.csgraph import connected_components  # which takes long to import
-
     require_positive("sensor_noise", sensor_noise)
     problem = problem.carried(hypotheses.push_distance)
     sdf, points = problem.sdf, problem.points
@@ -105,7 +103,7 @@ def trust_in(
     width = max(MOST_WIDTH * sdf.diameter, LEAST_LEVELS * sensor_noise)
     gap = max(width, LEAST_GAP * noise.sigma)
     near = apart <= gap
-    count, mode = connected_components(near & ~turned(sdf, poses, pairs=near), directed=False)
+    count, mode = _components(near & ~turned(sdf, poses, pairs=near))
     parts = [np.flatnonzero(mode == one) for one in range(count)]
     redundancy = max(len(off) - FREEDOMS, 0)
     why = ""
@@ -324,6 +322,26 @@ def _mean_error(
         errors.append(depths[depths > tolerance])
     every = np.concatenate(errors)
     return float(in_order(every)) / max(len(every), 1)
+
+
+def _components(adjacent: BoolArray) -> tuple[int, IntArray]:
+    """Return the number of parts of a symmetric graph (K, K), and the part of each node (K,).
+
+    As connected_components of scipy.sparse, whose import takes longer than a registration.
+    """
+    count = 0
+    part = np.full(len(adjacent), -1)
+    for first in range(len(adjacent)):
+        if part[first] >= 0:
+            continue
+        reached = np.zeros(len(adjacent), dtype=np.bool_)
+        newest = np.arange(len(adjacent)) == first
+        while newest.any():
+            reached |= newest
+            newest = adjacent[newest].any(axis=0) & ~reached
+        part[reached] = count
+        count += 1
+    return count, part
 
 
 def motion_cost(

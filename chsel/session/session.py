@@ -223,6 +223,11 @@ class Session:
         return self._run.step
 
     @property
+    def outcome(self) -> str:
+        """Outcome of what was added last: "contact", "free" or "points"; "" before."""
+        return self._run.outcome
+
+    @property
     def answer(self) -> Hypotheses | None:
         """The last result, with trust; None before the first."""
         return self._run.answer

@@ -13,7 +13,7 @@ from tests.runners.box_session import POSE, points_session
 
 SESSION = """
 import sys
-import chsel.methods
+import chsel.session.judging
 from numba.core.dispatcher import Dispatcher
 from runners import probe
 
@@ -27,15 +27,15 @@ def specialised():
         for signature in kernel.nopython_signatures
     }
 
-def noting(*given):
+def noting(*given, **named):
     compiled.update(specialised())
-    return run(*given)
+    return run(*given, **named)
 
 class Always(str):  # as if every verdict needed rivals
     __eq__ = lambda self, other: True
 
-chsel.methods.DETERMINED = Always()
-compiled, run, probe.run = set(), probe.run, noting
+chsel.session.judging.DETERMINED = Always()
+compiled, run, probe.run_session = set(), probe.run_session, noting
 probe.main()
 print("compiled", len(compiled), "more", sorted(specialised() - compiled))
 """

@@ -243,7 +243,10 @@ def test_ctrl_c_ends_with_a_whole_recording_and_status_130(points, tmp_path):
     ("override", "message"),
     [
         ("+typo=3", "probe.typo does not exist; accepted: assets"),
-        ("method.descent.iterations=9", "method=anchored has no key 'descent'; accepted: size, "),
+        (
+            "method.descent.iterations=9",
+            "method=anchored has no key 'descent'; did you mean modes? accepted: size, ",
+        ),
         ("method=chsel method.cst.alpha=1", "has no key 'cst'; did you mean cost? accepted: "),
         ("methd=chsel", "probe has no key 'methd'; did you mean method? accepted: "),
         ("definition=paper", "Could not override 'definition'. No match in the defaults list"),

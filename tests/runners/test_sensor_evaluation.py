@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from chsel.errors import SettingError
-from chsel.events import RigDescribed
+from chsel.events import RigDescribed, Start
 from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.poses import compose, inverse, roll_pitch_yaw, rotation_angle, rotation_vector
@@ -168,7 +168,7 @@ def test_a_trial_gets_its_log_its_true_pose_and_its_results(tmp_path, monkeypatc
     apart = np.linalg.norm((found @ centre - truth @ centre)[:3])
     assert told["from_known"]["position"] == pytest.approx(apart, abs=1e-9)
     session = open_recorded(plan, trial)
-    assert session.start == (1, 0)
+    assert session.start == Start(contacts=1)
     elsewhere = replace(plan, folder=tmp_path / "again", logs=log.parents[1])
     assert do_task(elsewhere, Task(trial)) == ""
     first, second = (trial.folder(one) / "session.mcap" for one in (plan, elsewhere))

@@ -74,7 +74,7 @@ def test_a_kernel_is_compiled_again_if_anything_that_it_contains_has_changed(tmp
     assert near(NEAR) == [-2.0, 1.0]
     constant.write_text("STEP = 1.0\n")
     assert near(NEAR) == [0.0, 0.0]
-    session = tmp_path / "chsel" / "session.py"  # no kernel imports it
+    session = tmp_path / "chsel" / "session" / "session.py"  # no kernel imports it
     session.write_text(session.read_text() + "EDITED = True\n")
     assert near(NEAR) == [0.0, 0.0]
 

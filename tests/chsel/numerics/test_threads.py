@@ -121,7 +121,7 @@ def test_arithmetic_that_flushes_subnormals_is_refused():
 
 
 def register():
-    points = {"surface": np.array([[0.025, 0.0, 0.0]]), "free": np.array([[0.1, 0.0, 0.0]])}
+    points = {"contacts": np.array([[0.025, 0.0, 0.0]]), "free": np.array([[0.1, 0.0, 0.0]])}
     settings = {"descent": {"restarts": 1, "iterations": 1}, "emitter": {"iterations": 1}}
     chsel.register(ball_grid(0.025, 0.01, half=4), **points, method="chsel", settings=settings)
 

@@ -10,7 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from chsel.errors import SettingError
-from chsel.events import Probe
+from chsel.events import Probe, Start
 from chsel.next_probe.action_lattice import ActionSettings
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.settings import settings_mapping
@@ -65,7 +65,7 @@ def test_a_source_of_every_kind_has_all_members_of_the_protocol(kind, tmp_path):
     sides[ObjectOrigin.RECORDED] = read_recording(RECORDING).start.free_resolution
     assert source.free_resolution == sides[origin]
     assert isinstance(source.initial_points, KnownPoints)
-    assert source.start == (3, 2)
+    assert source.start == Start(contacts=3, step=2)
     assert source.push_distance == 0.0
     assert len(source.warnings) == 0
     assert (source.report is None) == (kind != "sensors")
@@ -93,7 +93,8 @@ def test_a_recorded_source_brings_its_object_and_its_start():
     assert source.recorded.object == start.object == "mustard"
     assert source.recorded.sdf.digest == start.sdf.digest
     config = start.config["session"]
-    assert source.start == (config["start_contacts"], config["start_probe"])
+    assert source.start.contacts == config["start_contacts"]
+    assert source.start.step == config["start_probe"]
     assert len(source.offer(ActionSettings())) == source.count
 
 
