@@ -14,8 +14,8 @@ from typing import Annotated, Any
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.csv
 from omegaconf import DictConfig
+from pyarrow import csv
 
 from chsel.errors import SettingError
 from chsel.methods.method import Method
@@ -108,7 +108,7 @@ def main(config: DictConfig) -> None:
                 rows += case.rows(methods, seeds)
     file = Path(checked.out).expanduser() / "results.csv"
     with whole_file(file) as beside:
-        pa.csv.write_csv(pa.Table.from_pylist(rows), beside)
+        csv.write_csv(pa.Table.from_pylist(rows), beside)
     made = {"commands": [this_command()], "environments": [environment()]}
     with whole_file(file.with_name(MADE)) as beside:
         beside.write_text(json.dumps(made, indent=1) + "\n")

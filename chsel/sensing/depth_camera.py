@@ -7,10 +7,6 @@ from math import hypot, isqrt, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_erosion, label, minimum_filter
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from chsel.errors import (
     InputWarning,
@@ -176,6 +172,8 @@ def occlusion_edges(
 
 def _least_around(image: FloatArray, reach: int) -> FloatArray:
     """Return the least (H, W) of the pixels up to `reach` from each, along rows and columns."""
+    from scipy.ndimage import minimum_filter  # which takes long to import
+
     return minimum_filter(image, 2 * reach + 1, mode="constant", cval=np.inf)
 
 
@@ -196,6 +194,8 @@ def depth_regions(
     more than `jump` times the depth, besides what a surface steeply inclined to the ray explains.
     counts (H, W): pixels with a depth above 0.
     """
+    from scipy.ndimage import label  # which takes long to import
+
     depth = np.where(counts, np.asarray(depth, dtype=np.float64), 0.0)
     height, width = depth.shape
     cells = np.zeros((2 * height - 1, 2 * width - 1), dtype=bool)  # pixels, and links between them
@@ -211,6 +211,10 @@ def point_regions(points: FloatArray, gap: float) -> IntArray:
     Points up to `gap` metres apart are connected, or up to four times the typical distance between
     neighbours where that is more. Points more than 3.5 times as far apart are not.
     """
+    from scipy.sparse import csr_array  # which takes long to import
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
     if len(points) < 2:
         return np.ones(len(points), dtype=np.int64)
     asked = points[:: -(-len(points) // _MOST_ASKED)]
@@ -307,6 +311,8 @@ def depth_look(
     at most, metres. Pixels beside jumps of depth, at the mask's outline and in its small regions
     are left out. Raise PointsError for an image without a depth, or a mask without a pixel left.
     """
+    from scipy.ndimage import binary_erosion  # which takes long to import
+
     pose = frozen(
         "world_from_camera", world_from_camera, shape=(4, 4), error=PoseError, most=FARTHEST_PLACE
     )
@@ -365,6 +371,8 @@ def outside_of(on_object: FloatArray, free: FloatArray, *, spacing: float) -> Fl
     """
     if len(on_object) == 0 or len(free) == 0:
         return free
+    from scipy.spatial import cKDTree  # which takes long to import
+
     margin = sqrt(0.75) * spacing
     nearest = cKDTree(on_object).query(free, distance_upper_bound=margin)[0]
     return free[~(nearest <= margin)]

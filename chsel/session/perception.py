@@ -24,12 +24,11 @@ from chsel.problem.points import (
     world_points,
 )
 from chsel.problem.poses import apply, inverse, nearest_rigid
+from chsel.sensing.depth_camera import DepthLook, PinholeCamera, depth_look, outside_of
 from chsel.sensing.free_space import FreeGrid, interior_lattice, poses_between
 
 if TYPE_CHECKING:
     import trimesh
-
-    from chsel.sensing.depth_camera import DepthLook
 
 _ACROSS = 15.0  # to a diameter: points on the object that a depth image gives
 _MOST_WHOLE = 20  # m: of depths in whole numbers
@@ -176,8 +175,6 @@ class Intake:
             grid.from_depth(
                 look.ends, look.camera, world_from_camera=look.pose, mask=look.rays, fraction=1.0
             )
-        from chsel.sensing.depth_camera import outside_of  # scipy takes long to import
-
         free = outside_of(surface, grid.new(), spacing=self._started.free_resolution)
         known = KnownPoints(free=free).merged(prepared.probe.new_points)
         probe = replace(prepared.probe, new_points=known)
@@ -268,8 +265,6 @@ def perceived(
     look = None
     side = diameter / _ACROSS
     if depth is not None:
-        from chsel.sensing.depth_camera import PinholeCamera, depth_look  # as above
-
         depth = _depths(depth)
         if not isinstance(camera, PinholeCamera):
             height, width = depth.shape

@@ -13,8 +13,8 @@ from typing import Any
 
 import pandas as pd
 import pyarrow as pa
-import pyarrow.csv
 from filelock import FileLock, Timeout
+from pyarrow import csv, parquet
 
 from chsel.errors import RecordingError, SettingError
 from replay.environment import environment
@@ -101,14 +101,14 @@ def write_part(path: Path, rows: Sequence[Row], *, schema: pa.Schema, source: st
     """Write a finished part of a table. source: kept with it, see `part_source`."""
     table = pa.Table.from_pylist([dict(row) for row in rows], schema=schema)
     with whole_file(path) as beside:
-        pa.parquet.write_table(table.replace_schema_metadata({"about": source}), beside)
+        parquet.write_table(table.replace_schema_metadata({"about": source}), beside)
 
 
 def part_source(path: Path) -> str | None:
     """Return the source that was kept with a part; None if there is no part."""
     if not path.exists():
         return None
-    return (pa.parquet.read_schema(path).metadata or {}).get(b"about", b"").decode()
+    return (parquet.read_schema(path).metadata or {}).get(b"about", b"").decode()
 
 
 def writing_alone(folder: Path, say: Callable[[str], None]) -> AbstractContextManager[object]:
@@ -129,9 +129,9 @@ def collect(folder: Path) -> pa.Table:
     for name in [*searches, "probes" if experiment["policies"] else "results"]:
         table = gathered(folder, experiment, name=name)
         with whole_file(folder / f"{name}.parquet") as beside:
-            pa.parquet.write_table(table, beside)
+            parquet.write_table(table, beside)
         with whole_file(folder / f"{name}.csv") as beside:
-            pa.csv.write_csv(table, beside)
+            csv.write_csv(table, beside)
     return table
 
 
@@ -147,7 +147,7 @@ def gathered(folder: Path, experiment: Mapping[str, Any], *, name: str) -> pa.Ta
             for label in labels:  # the first file with one of the suffixes
                 files = [trial / f"{label}{suffix}" for suffix in suffixes]
                 for path in [file for file in files if file.exists()][:1]:
-                    part = pa.parquet.read_table(path, partitioning=None)
+                    part = parquet.read_table(path, partitioning=None)
                     tables.append(part.replace_schema_metadata().cast(schema))
     order = [(key, "ascending") for key in _ORDER if key in schema.names]
     return pa.concat_tables(tables).sort_by(order).combine_chunks()

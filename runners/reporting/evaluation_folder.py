@@ -12,7 +12,7 @@ from typing import Any
 
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet
+from pyarrow import parquet
 
 from runners.evaluation.contenders import repeat_of
 from runners.evaluation.experiment import TABLES, gathered, read_experiment
@@ -79,7 +79,7 @@ def _table(folder: Path, experiment: Mapping[str, Any], *, name: str) -> pd.Data
     if bool(experiment["policies"]) == (name == "probes"):
         there = path.exists()
         table = (
-            pa.parquet.read_table(path, partitioning=None)
+            parquet.read_table(path, partitioning=None)
             if there
             else gathered(folder, experiment, name=name)
         )
