@@ -58,7 +58,7 @@ def _markdown(table: Table, without: Sequence[str] = ()) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
-def table(name: str, title: str, *, baseline: str | None = None, without: str = "") -> str:
+def table(name: str, title: str, baseline: str | None = None, without: str = "") -> str:
     """A table of the report of an evaluation, by its title; without: columns, by semicolons."""
     found = [
         table
@@ -89,7 +89,7 @@ def _chosen(rows: pd.DataFrame, where: Mapping[str, Any]) -> pd.DataFrame:
     return rows
 
 
-def ratio(name: str, method: str, *, to: str, **where: Any) -> str:
+def ratio(name: str, method: str, to: str, **where: Any) -> str:
     """PD by that of another method at the same steps; what may be 1 is said to be within noise."""
     own = _chosen(_with_ratios(name, to), {"method": method, **where})
     mean, lower, upper = statistics.ratio_interval(own)
@@ -98,7 +98,7 @@ def ratio(name: str, method: str, *, to: str, **where: Any) -> str:
     )
 
 
-def worse(name: str, methods: list[str], *, to: str) -> str:
+def worse(name: str, methods: list[str], to: str) -> str:
     """Whether methods have a higher PD than another one, beyond their intervals."""
     intervals = [
         statistics.ratio_interval(_chosen(_with_ratios(name, to), {"method": method}))
@@ -109,7 +109,7 @@ def worse(name: str, methods: list[str], *, to: str) -> str:
     return "no" if all(upper < 1.0 for *_, upper in intervals) else "within noise"
 
 
-def better(name: str, method: str, *, than: str, **where: Any) -> str:
+def better(name: str, method: str, than: str, **where: Any) -> str:
     """The share of steps at which a method has a lower PD than another one."""
     own = _chosen(_with_ratios(name, than), {"method": method, **where})["ratio"].dropna()
     return percent((own < 1.0 - 1e-9).mean())
@@ -125,7 +125,7 @@ def median(name: str, column: str, **where: Any) -> str:
     return number(numbers(name, column, **where).median())
 
 
-def share(name: str, column: str, *, below: float | None = None, **where: Any) -> str:
+def share(name: str, column: str, below: float | None = None, **where: Any) -> str:
     """Of rows with a flag, or with a number below a limit; Wilson's interval."""
     values = numbers(name, column, **where)
     flags = values > 0.5 if below is None else values < below
@@ -184,7 +184,7 @@ def levels(name: str) -> list[str]:
     return [level for level in LEVELS if level in there]
 
 
-def moment(method: str, iteration: int, *, column: str = "diversity") -> str:
+def moment(method: str, iteration: int, column: str = "diversity") -> str:
     """Median of the searches of `paper_qd` after so many iterations."""
     rows = evaluation("paper_qd").iterations
     own = rows[(rows["method"] == method) & (rows["iteration"] == iteration)]

@@ -74,7 +74,7 @@ def table(folder, name="results"):
 def test_every_experiment_can_be_planned(path, tmp_path, monkeypatch):
     planned: list[tuple[Plan, list[Trial]]] = []
 
-    def instead(plan, trials, *_):
+    def instead(plan, trials, **_):
         planned.append((plan, trials))
         return False
 

@@ -30,7 +30,9 @@ DIGESTS = """
 from runners.objects.loader import load_model
 from runners.sessions.probing_settings import ProbingSettings
 from runners.sessions.probing import open_probing
-session = open_probing("simulated", load_model("spam_can", 2.5), "can", ProbingSettings(), 5)
+model = load_model("spam_can", 2.5)
+settings = ProbingSettings()
+session = open_probing("simulated", model, configuration_name="can", settings=settings, seed=5)
 print(session.world_from_object.tobytes().hex(), session.initial_points.digest)
 for probe, _ in zip(session.probes(), range(4)):
     print(probe.new_points.digest, probe.gripper_path.tobytes().hex()[-200:], probe.outcome)
