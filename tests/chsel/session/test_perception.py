@@ -11,7 +11,7 @@ import chsel
 from chsel.problem.poses import apply, compose, inverse
 from replay.mcap.reader import read_recording
 from tests.chsel.samples import box_distance
-from tests.chsel.test_session import (
+from tests.chsel.session.test_session import (
     BOX,
     CAMERA,
     CONTACTS,

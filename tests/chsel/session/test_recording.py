@@ -12,7 +12,7 @@ from chsel.errors import RecordingError
 from replay.comparing.verification import EQUAL, verify
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
-from tests.chsel.test_session import BOX, CAMERA, CONTACTS, HAND, LOOK
+from tests.chsel.session.test_session import BOX, CAMERA, CONTACTS, HAND, LOOK
 
 QUICK = {"settings": {"size": "small"}, "hand": HAND}
 ROOM = chsel.Workspace((0.2, -0.1, 0.0), (0.6, 0.3, 0.3))
