@@ -143,15 +143,15 @@ def compared(
         step = posed.step
         judge = CompiledCost.of(posed.problem, cost.settings)
         start = recording.start_at(posed.step)
-        recorded = recording.hypotheses(step) if recording.has_result(step) else None
-        numbers = (
-            {}
-            if recorded is None
-            else _all_numbers(
+        recorded = None
+        numbers: dict[str, float] = {}
+        failure = "no result was recorded"
+        if recording.has_result(step):
+            recorded = recording.hypotheses(step)
+            failure = ""
+            numbers = _all_numbers(
                 recorded, judge, start=start, problem=posed.problem, plausible=plausible
             )
-        )
-        failure = "" if recorded is not None else "no result was recorded"
         yield Outcome(
             step, recorded_label(recording), hypotheses=recorded, numbers=numbers, failure=failure
         )
