@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -97,7 +97,7 @@ def most_informative_first(points: KnownPoints) -> KnownPoints:
     """
     first = farthest_points(points.known, _MOST_ORDERED)
     order = np.concatenate([first, np.setdiff1d(np.arange(len(points.known)), first)])
-    return replace(points, known=points.known[order], known_sdf=points.sdf[order])
+    return points.with_known(order)
 
 
 class AnchorSampler:

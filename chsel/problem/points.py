@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -45,7 +45,11 @@ MOST_AWAY = 100.0  # from the world's origin, or the workspace, to what a robot 
 _LEAST_AWAY = 50.0  # the same for small objects, metres
 
 POINT_CLASSES = ("free", "occupied", "known")
-_ARRAYS = (*POINT_CLASSES, "known_sdf")
+_OF_KNOWN = ("known", "known_sdf", "normals", "normal_noise")
+_ARRAYS = ("free", "occupied", *_OF_KNOWN)
+_UNIT = 1e-6  # by which the squared length of a normal may be off
+_NEAR_UNIT = 0.01  # the same of the length of one that a program or a file gives
+NORMAL_NOISE = 0.25  # radians, of normals about which nothing else is known
 _BLOCK = np.array(list(np.ndindex(3, 3, 3))) - 1  # a voxel, at index 13, and its 26 neighbours
 _MOST_VOXELS = 2.0**62  # that can be numbered
 
@@ -66,6 +70,10 @@ class KnownPoints(ShapesShown):
     occupied: FloatArray = field(default_factory=_no_points)  # (K, 3), inside of it
     known: FloatArray = field(default_factory=_no_points)  # (M, 3), of known signed distance
     known_sdf: FloatArray | None = None  # (M,), that distance; None: 0 for all, contacts
+    # (M, 3), unit vectors out of the object; 0 where they are not known. None: nowhere.
+    normals: FloatArray = None  # type: ignore[assignment]  # as is the next one
+    # (M,), root mean square of the angle that a normal is off by, radians; 0 where there is none.
+    normal_noise: FloatArray = None  # type: ignore[assignment]
 
     def __new__(cls, *unnamed: Any, **named: Any) -> Self:
         if len(unnamed) == 1 and not named:
@@ -82,6 +90,29 @@ class KnownPoints(ShapesShown):
                 f"known_sdf has {len(self.sdf)} entries; accepted: one per known point, "
                 f"{len(self.known)}"
             )
+        self._set_normals()
+
+    def _set_normals(self) -> None:
+        count = len(self.known)
+        normals = np.zeros((count, 3)) if self.normals is None else self.normals
+        noise = np.zeros(count) if self.normal_noise is None else self.normal_noise
+        normals = frozen("normals", normals, shape=(count, 3))
+        noise = frozen("normal_noise", noise, shape=(count,))
+        given = (normals != 0.0).any(axis=1)
+        wrong = given & (np.abs((normals**2).sum(axis=1) - 1.0) > _UNIT)
+        if wrong.any():
+            at = int(np.argmax(wrong))
+            length = math.sqrt(float((normals[at] ** 2).sum()))
+            raise PointsError(f"normals[{at}] is {length:.6g} long; accepted: unit vectors, or 0")
+        wrong = np.where(given, (noise <= 0.0) | (noise > math.pi), noise != 0.0)
+        if wrong.any():
+            at = int(np.argmax(wrong))
+            raise PointsError(
+                f"normal_noise[{at}] is {noise[at]:.6g}; accepted: above 0, up to pi, radians, "
+                "and 0 for a point without a normal"
+            )
+        object.__setattr__(self, "normals", normals)
+        object.__setattr__(self, "normal_noise", noise)
 
     @property
     def sdf(self) -> FloatArray:
@@ -99,10 +130,21 @@ class KnownPoints(ShapesShown):
         """The known points on the surface, with signed distance 0 (M', 3)."""
         return self.known[self.sdf == 0.0]
 
+    @property
+    def has_normals(self) -> bool:
+        """Whether the normal of any known point is known."""
+        return bool(self.normal_noise.any())
+
     @cached_property
     def digest(self) -> str:
         """Digest of all points, in their order."""
-        return digest(*(getattr(self, name) for name in _ARRAYS))
+        arrays = [getattr(self, name) for name in (*POINT_CLASSES, "known_sdf")]
+        return digest(*arrays, *([self.normals, self.normal_noise] if self.has_normals else []))
+
+    def with_known(self, which: Any) -> KnownPoints:
+        """Return these points with some of the known ones: by flags (M,), indices or a slice."""
+        parts = {name: getattr(self, name)[which] for name in _OF_KNOWN}
+        return replace(self, **parts)
 
     def merged(self, new: KnownPoints) -> KnownPoints:
         """Return these points followed by new ones, class by class."""
@@ -160,6 +202,44 @@ def world_points(name: str, given: Any) -> FloatArray:
     """
     given = _no_points() if given is None else given
     return frozen(name, given, shape=(None, 3), most=FARTHEST_PLACE)
+
+
+def unit_normals(name: str, given: Any, *, noise: Any, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return normals (N, 3) and their noise (N,) as a program or a file gives them, radians.
+
+    name: of the normals, in errors. given: None for no normals; (0, 0, 0) for one that is not
+    known. noise: one number for all, or one each; None for NORMAL_NOISE.
+    Raises PointsError for another count, for NaN, and for lengths that are not 1.
+    """
+    if given is None:
+        if noise is not None:
+            raise PointsError(f"normal_noise has no {name}; accepted: both, or none")
+        return np.zeros((count, 3)), np.zeros(count)
+    normals = frozen(name, given, shape=(None, 3))
+    if len(normals) != count:
+        raise PointsError(f"{name} has {len(normals)} rows; accepted: one per point, {count}")
+    lengths = np.sqrt((normals**2).sum(axis=1, keepdims=True))
+    wrong = (lengths[:, 0] > 0.0) & (np.abs(lengths[:, 0] - 1.0) > _NEAR_UNIT)
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        raise PointsError(
+            f"{name}[{at}] is {lengths[at, 0]:.4g} long; accepted: unit vectors out of the "
+            "object, or 0 where a normal is not known"
+        )
+    one = np.ndim(noise) == 0
+    noise = frozen(
+        "normal_noise", [NORMAL_NOISE if noise is None else noise] if one else noise, shape=(None,)
+    )
+    if not one and len(noise) != count:
+        raise PointsError(f"normal_noise has {len(noise)} entries; accepted: one, or {count}")
+    if not ((noise > 0.0) & (noise <= math.pi)).all():
+        text = "in degrees? " if (noise > math.pi).any() else ""
+        raise PointsError(
+            f"normal_noise is {noise.max() if text else noise.min():.4g}: {text}accepted: above 0, "
+            "up to pi, radians"
+        )
+    unit = normals / np.where(lengths > 0.0, lengths, 1.0)
+    return unit, np.where(lengths[:, 0] > 0.0, noise, 0.0)
 
 
 def world_known_points(
@@ -235,12 +315,7 @@ def distinct_points(
     count = len(fresh) + len(inside)
     if repeated == 0:
         return new, []
-    kept = KnownPoints(
-        free=new.free,
-        occupied=new.occupied[inside],
-        known=new.known[fresh],
-        known_sdf=new.sdf[fresh],
-    )
+    kept = replace(new, occupied=new.occupied[inside]).with_known(fresh)
     if repeated <= MANY_REPEATED * count:
         return kept, []
     text = (

@@ -117,7 +117,14 @@ class EventReader:
             for topic, columns in CLOUDS.items()
         }
         free, occupied, known = clouds.values()
-        points = KnownPoints(free, occupied, known=known[:, :3], known_sdf=known[:, 3])
+        points = KnownPoints(
+            free,
+            occupied,
+            known=known[:, :3],
+            known_sdf=known[:, 3],
+            normals=values["normals"],
+            normal_noise=values["normal_noise"],
+        )
         counts = {name: len(getattr(points, name)) for name in POINT_CLASSES}
         before = self._counts or {name: values[name] - counts[name] for name in counts}
         self._counts = {name: before[name] + count for name, count in counts.items()}

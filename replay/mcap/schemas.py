@@ -103,6 +103,8 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "free": "uint64",
         "occupied": "uint64",
         "known": "uint64",
+        "normals": "f8[N,3]?",  # of new known points, 0 where unknown; absent where all are
+        "normal_noise": "f8[N]?",  # radians
     },
     "Pushes": {"directions": "f8[P,3]", "before": "i8[P,3]", "largest": "double"},
     "Problem": {

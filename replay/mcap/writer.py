@@ -177,6 +177,8 @@ class McapRecorder(Recorder):
         values: dict[str, Any] = {name: len(getattr(self._points, name)) for name in POINT_CLASSES}
         values |= {f"new_{name}": len(getattr(new, name)) for name in POINT_CLASSES}
         values |= {"step": step, "new_digest": new.digest}
+        if new.has_normals:
+            values |= {"normals": new.normals, "normal_noise": new.normal_noise}
         self._record("/known_points", step, values=values)
 
     def _write_problem(self, event: ProblemPosed) -> None:

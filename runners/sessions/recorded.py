@@ -241,10 +241,7 @@ class RecordedActions:
         earlier = np.flatnonzero(chosen & (self._first < action))
         chosen[earlier] = self._swept(self._voxels[earlier], probe.gripper_path)
         self._given |= chosen
-        points = probe.new_points
-        new = KnownPoints(
-            self._free[chosen], points.occupied, known=points.known, known_sdf=points.known_sdf
-        )
+        new = replace(probe.new_points, free=self._free[chosen])
         return replace(probe, step=step, new_points=new)
 
     def _swept(self, voxels: np.ndarray, path: FloatArray) -> BoolArray:

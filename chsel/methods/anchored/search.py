@@ -69,7 +69,7 @@ class Search:
         self._space = search_space(settings.plane, problem.sdf)
         contacts = most_informative_first(problem.points)
         most = self._effort.contacts
-        self._known = replace(contacts, known=contacts.known[:most], known_sdf=contacts.sdf[:most])
+        self._known = contacts.with_known(slice(most))
         bounds = origin_bounds(problem.workspace, self._space, margin=settings.anchors.margin)
         centre = object_centre(problem.sdf)
         self._twists = twists_of(self._space, centre)
