@@ -32,7 +32,7 @@ from chsel.problem.surface import has_surface, surface_points
 
 UNIT = 2.0**-14  # metres that scores count in, so that a table of 16 bits reaches 2 m
 NO_POSE = 2**62  # above the keys of all poses
-_ZERO, _HALF = np.float32(0.0), np.float32(0.5)
+_ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _MOST_SAMPLES = 100_000_000
 _MOST_KEPT = 100_000
 _SURFACE_POINTS = 400  # of which 80 000 pairs are of all lengths
@@ -47,15 +47,19 @@ _SAMPLES_PER_THREAD = 5_000  # fewer take less time than to wake another thread
 _LENGTHS_ALIKE = 0.004  # metres, about half of the distance between surface points
 _LEAST_LENGTH = 0.01  # metres between two contacts that give a direction
 _ROUNDING = 2e-6  # of coordinates in 32 bits, generously
-_FARTHEST = 1e6  # metres: coordinates beyond are taken for it, so that no sum overflows
 _REACH = 0.06  # metres beyond which known points cost no more, as they may be outliers
 _DEEP = 0.3  # of the greatest depth: points inside are at least so deep, as the rest may be noise
 _MOST_NODES = 4000  # of which they are chosen; the time for that grows with them
 _WEIGHT, _BEYOND = 5.0, 20.0  # of their mean depths in free space, all and those beyond tolerance
 _MOST_COST = 2**30  # of all points inside, so that no sum overflows
 _MOST_VOXELS = 20_000_000  # of free space: bytes
+_FARTHEST = 1e6  # metres: coordinates beyond are taken for it, so that no sum overflows
 _FAR = np.float32(0.6)  # from an axis: more than 1 / sqrt(3), so that any direction is far from one
 _SHORTEST_SQUARED = np.float32(1e-9)  # of vectors that give a direction
+_OFF_NORMAL = 0.02  # metres that the normal of a contact costs which is across
+_MOST_OFF_NORMAL = 0.03  # and any other one, at most
+_GRADIENT = 127.0  # units of gradients of length 1 in a table of 8 bits
+_PER_GRADIENT = np.float32(1.0 / _GRADIENT)
 
 
 @dataclass(frozen=True)
@@ -308,6 +312,7 @@ class AnchorSampler:
         if is_free.size == 1:
             inside, costs = inside[:0], costs[:0]
         contacts = known.known[:_MOST_CONTACTS]
+        by_normal = known.has_normals
         costs = max(len(contacts), 1) / (max(len(costs), 1) * UNIT) * costs
         return CoarseScore(
             lower=self._lower,
@@ -317,6 +322,15 @@ class AnchorSampler:
             contacts=_in_32_bits(contacts - self._middle).T.copy(),
             known_sdf=_in_32_bits(known.sdf[:_MOST_CONTACTS] / UNIT),
             reach=np.float32(_REACH / UNIT),
+            by_normal=by_normal,
+            gradients=sdf.derived("coarse gradients", lambda: _coarse_gradients(sdf))
+            if by_normal
+            else np.zeros(1, dtype=np.int8),
+            normals=_in_32_bits(known.normals[:_MOST_CONTACTS]).T.copy(),
+            off_normal=_in_32_bits(
+                np.where(known.normal_noise[:_MOST_CONTACTS] > 0.0, _OFF_NORMAL / UNIT, 0.0)
+            ),
+            most_off_normal=np.float32(_MOST_OFF_NORMAL / UNIT),
             left_out=left_out,
             inside=_in_32_bits(inside),
             weights=np.rint(np.minimum(costs, _MOST_COST / max(len(costs), 1))).astype(np.int32),
@@ -338,6 +352,11 @@ def _unit(vectors: Any) -> Any:
 
 def _in_32_bits(values: Any) -> Any:
     return np.clip(values, -_FARTHEST, _FARTHEST).astype(np.float32)
+
+
+def _coarse_gradients(sdf: SdfGrid) -> Any:
+    """Return gradients at nodes, flat, 8 bits."""
+    return np.rint(_GRADIENT * sdf.gradients).astype(np.int8).reshape(-1)
 
 
 def _in_units(metres: FloatArray) -> Any:
@@ -449,6 +468,11 @@ class CoarseScore(NamedTuple):
     contacts: Any  # (3, A), world
     known_sdf: Any  # (A,), in UNITs
     reach: Any  # UNITs beyond which a known point costs no more
+    by_normal: bool  # whether normals count
+    gradients: Any  # (3 nodes,), 8 bits, of signed distances; (1,) if normals do not count
+    normals: Any  # (3, A), of contacts, world
+    off_normal: Any  # (A,), UNITs that a normal costs which is across; 0 where there is none
+    most_off_normal: Any  # UNITs that a normal costs at most
     left_out: int  # contacts that cost the most and do not count: 0 or 1
     inside: Any  # (P, 3), object frame
     weights: Any  # (P,), cost of each in free space, in UNITs of the sum over contacts
@@ -510,6 +534,8 @@ def _coarse_score(score, pose, nodes, beyond, limit):
     for n in range(len(nodes)):
         off = np.float32(score.values[nodes[n]]) + (beyond[n] - score.known_sdf[n])
         cost = np.int64(min(abs(off), score.reach))
+        if score.by_normal:
+            cost += _normal_cost(score, pose, n, nodes[n])
         total, worst = total + cost, max(worst, cost)
     total -= score.left_out * worst
     voxels = score.voxels
@@ -523,6 +549,19 @@ def _coarse_score(score, pose, nodes, beyond, limit):
         x, y, z = _clipped(x, most[0]), _clipped(y, most[1]), _clipped(z, most[2])
         total += score.is_free[_node(voxels, x, y, z)] * score.weights[n]
     return total
+
+
+@leaf
+def _normal_cost(score, pose, n, node):
+    """Return the cost of a contact's normal beside the gradient at the node nearest to it."""
+    normals = score.normals
+    x, y, z = turned(pose, normals[0, n], normals[1, n], normals[2, n])
+    at = np.uint64(3) * np.uint64(node)
+    u = np.float32(score.gradients[at])
+    v = np.float32(score.gradients[at + np.uint64(1)])
+    w = np.float32(score.gradients[at + np.uint64(2)])
+    cosine = (x * u + y * v + z * w) * _PER_GRADIENT
+    return np.int64(min(score.off_normal[n] * (_ONE - cosine), score.most_off_normal))
 
 
 @leaf

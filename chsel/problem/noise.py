@@ -1,16 +1,25 @@
 """A model of the errors of points, and the energy of poses by it.
 
-    E(X) = -log sum_k w_k prod_i [(1 - e) N(r_i; 0, s_k) + e / D]^t
-           + t F(sum_j min(d_j^2 / 2 f^2, c))
+    E(X) = -log sum_k w_k prod_i [(1 - e) N(r_i; 0, s_k) F_i + e / D]^t
+           + t sum_j min(d_j^2 / 2 f^2, c)
 
 in nats, up to a constant: minus the log-likelihood of a pose by all points. Known points have
 residuals r_i = s(X p_i) - v_i, free points depths d_j below the surface, occupied ones heights d_j
 above it. Contacts are off by s_k^2 = n^2 + m_k^2: the noise n of the sensor, and errors m_k of
 mesh, hand and camera, of which only a prior w_k is known; so the sum over k is the evidence for
 the pose. A share e of the contacts is on other objects, anywhere within D. The border of a free
-voxel is off by f, and one in exp(c) is wrong; where one is, others are likelier to be, so beyond c
-costs count less (F). Many points have errors in common: with N > INDEPENDENT known ones, t is
-INDEPENDENT / N.
+voxel is off by f, and one in exp(c) is wrong. Many points have errors in common: with
+N > INDEPENDENT known ones, t is INDEPENDENT / N.
+
+F_i is 1 for a contact without a normal. Else it is the density of the normal by that of a uniform
+direction, where a share a of the normals is wrong:
+
+    F_i = (1 - a) (1 + 2 b)^2 / ((1 + b) (1 + b (1 - cos))^3) + a,      b = 1 / 2 v
+
+cos is that of the angle between the normal and the gradient g_i of the distance at X p_i, and v the
+variance of the angle about each of two axes: that of the sensor, of a surface that is not flat, and
+1 - |g_i|, as gradients around an edge cancel. The density is that of Student's t with 4 degrees of
+freedom, on the sphere: normals that are off by more than stated cost little more.
 """
 
 from __future__ import annotations
@@ -34,7 +43,8 @@ _LEAST_ERROR, _MOST_ERROR = 0.0006, 0.008  # metres: m_1 and m_K, in geometric s
 _USUAL_ERROR, _WIDTH = 0.002, 0.6  # of w: centre in metres, standard deviation of ln m
 SHARE, EXTENT = 0.03, 0.15  # e, and D in metres
 SOFTNESS, WRONG = 0.002, 7.0  # f in metres, and c
-LATER = 0.2  # of the costs beyond c
+FACET = 0.05  # radians: what normals are off as a surface is not flat, about each axis
+WRONG_NORMALS = 0.1  # a
 INDEPENDENT = 30.0  # known points: of more, errors are alike
 _MEDIAN = 1.4826  # standard deviations of normal numbers by the median of their sizes
 _ROUNDS = 20
@@ -73,6 +83,14 @@ def estimate_noise(distances: FloatArray, sensor_noise: float) -> Noise:
     return Noise(max(sigma, sensor_noise), foreign / (PRIOR_CONTACTS + count))
 
 
+class PosedNormals(NamedTuple):
+    """Normals of N known points beside the gradients of the distance in B poses."""
+
+    noise: FloatArray  # (N,), radians; 0 where there is no normal
+    cosines: FloatArray  # (B, N), of the angles between normals and gradients
+    lengths: FloatArray  # (B, N), of the gradients
+
+
 @dataclass(frozen=True)
 class NoiseModel:
     """A model of the errors of points."""
@@ -82,29 +100,71 @@ class NoiseModel:
     softness: float = SOFTNESS  # f, metres
     wrong: float = WRONG  # c, nats
     shared: float = 0.0  # metres, of residuals and of depths, that cost nothing
+    least_normal_noise: float = 0.0  # radians, of normals whose own noise is less
 
-    def costs(self, residuals: FloatArray) -> FloatArray:
-        """Return -log of the density (..., K) of residuals (...), metres; 0 at 0 and s_1."""
+    def densities(self, residuals: FloatArray) -> FloatArray:
+        """Return (1 - e) N (..., K) of residuals (...), metres."""
         sigmas = np.array(self.sigmas)
         peak = (1.0 - SHARE) / (math.sqrt(2.0 * math.pi) * sigmas)
         sizes = np.maximum(np.abs(residuals) - self.shared, 0.0)[..., None]
-        density = peak * exps(-0.5 * (sizes / sigmas) ** 2) + SHARE / EXTENT
-        return logs((peak[0] + SHARE / EXTENT) / density)
+        return peak * exps(-0.5 * (sizes / sigmas) ** 2)
 
-    def energies(self, residuals: FloatArray, depths: FloatArray) -> FloatArray:
-        """Return E (B,) of poses by residuals (B, N) and depths (B, M), metres."""
-        costs = self.costs(residuals).sum(axis=1)
+    def normal_variances(self, noise: FloatArray) -> FloatArray:
+        """Return variances (N,) of normals of a noise (N,), about each of two axes, radians^2.
+
+        They are those on flat faces; 0 where there is no normal.
+        """
+        wide = np.maximum(noise, self.least_normal_noise)
+        return np.where(noise > 0.0, 0.5 * wide**2 + FACET**2, 0.0)
+
+    def greatest(self, variances: FloatArray) -> FloatArray:
+        """Return the greatest density (N,) of contacts whose normals have variances (N,)."""
+        peak = float(self.densities(np.zeros(1))[0, 0])
+        return peak * normal_factors(variances, np.ones(len(variances))) + SHARE / EXTENT
+
+    def energies(
+        self,
+        residuals: FloatArray,
+        depths: FloatArray,
+        *,
+        normals: PosedNormals | None = None,
+    ) -> FloatArray:
+        """Return E (B,) of poses by residuals (B, N) and depths (B, M), metres.
+
+        normals: of the known points; None where there are none.
+        """
+        density = self.densities(residuals)
+        variances = np.zeros(residuals.shape[1])
+        if normals is not None:
+            variances = self.normal_variances(normals.noise)
+            density = density * self._factors(variances, normals)[..., None]
+        greatest = self.greatest(variances)[:, None]
+        costs = logs(greatest / (density + SHARE / EXTENT)).sum(axis=1)
         power = self.power(residuals.shape[1])
         levels = power * costs - logs(np.array(self.weights))  # (B, K)
         least = levels.min(axis=1)
         known = least - logs(exps(least[:, None] - levels).sum(axis=1))
         deep = np.maximum(depths - self.shared, 0.0)
         wrong = np.minimum(0.5 * (deep / self.softness) ** 2, self.wrong).sum(axis=1)
-        return known + power * np.minimum(wrong, self.wrong + LATER * (wrong - self.wrong))
+        return known + power * wrong
+
+    def _factors(self, variances: FloatArray, normals: PosedNormals) -> FloatArray:
+        """Return F (B, N)."""
+        edges = np.maximum(1.0 - normals.lengths, 0.0)
+        spread = np.where(variances > 0.0, variances + edges, 0.0)
+        return normal_factors(spread, normals.cosines)
 
     def power(self, known: int) -> float:
         """Return t, for so many known points."""
         return min(1.0, INDEPENDENT / max(known, 1))
+
+
+def normal_factors(variances: FloatArray, cosines: FloatArray) -> FloatArray:
+    """Return F (...) by variances (...), radians^2, and cosines (...); 1 where a variance is 0."""
+    b = 0.5 / np.where(variances > 0.0, variances, 1.0)
+    off = 1.0 + b * (1.0 - cosines)
+    density = (1.0 + 2.0 * b) ** 2 / ((1.0 + b) * (off * off * off))
+    return np.where(variances > 0.0, (1.0 - WRONG_NORMALS) * density + WRONG_NORMALS, 1.0)
 
 
 def noise_model(sensor_noise: float, shared: float = 0.0) -> NoiseModel:

@@ -14,7 +14,7 @@ from chsel.numerics.pose_tuples import pose_at
 from chsel.numerics.threads import parallel_for
 from chsel.problem.poses import Poses, rotated
 from chsel.problem.sdf_grid import FARTHEST, SdfGrid
-from chsel.problem.sdf_lookup import distance_at, distance_field
+from chsel.problem.sdf_lookup import distance_at, distance_field, distance_with_gradient
 from chsel.problem.streams import Purpose, StreamKey
 
 _CENTRE_POINTS = 1000
@@ -193,6 +193,24 @@ def signed_distances(sdf: SdfGrid, poses: Poses, *, points: FloatArray) -> Float
     return np.minimum(surface_distances(sdf, poses, points=points), FARTHEST)
 
 
+def surface_gradients(sdf: SdfGrid, poses: Poses, *, points: FloatArray) -> FloatArray:
+    """Return gradients (B, N, 3) of the signed distance at world points (N, 3), object frame.
+
+    They point out of the object, and are shorter than 1 where faces meet.
+    """
+    field = distance_field(sdf, "trilinear", outside="surface_point")
+    numbers = np.array(poses.numbers)
+    places = np.array(points)
+    gradients = np.empty((len(poses), len(points), 3))
+
+    def run(first: int, last: int, _: Any) -> None:
+        gradients_in_poses(field, numbers, places, gradients, first, last)
+
+    least = 1 + _LOOKUPS_PER_THREAD // max(len(points), 1)
+    parallel_for(run, len(poses), scratch=lambda: None, least=least)
+    return gradients
+
+
 def in_order(values: FloatArray) -> FloatArray:
     """Return sums along the last axis, added in their order: the same on every machine."""
     if values.shape[-1] == 0:
@@ -225,6 +243,19 @@ def surface_distances(sdf: SdfGrid, poses: Poses, *, points: FloatArray) -> Floa
     least = 1 + _LOOKUPS_PER_THREAD // max(len(points), 1)
     parallel_for(run, len(poses), scratch=lambda: None, least=least)
     return distances
+
+
+@compiled
+def gradients_in_poses(
+    field: Any, poses: Any, places: Any, out: Any, first: Any, last: Any
+) -> None:
+    """Fill out (B, K, 3) with the gradients at world points (K, 3) in poses (B, 12)."""
+    for b in range(first, last):
+        pose = pose_at(poses, b)
+        for k in range(len(places)):
+            x, y, z = places[k, 0], places[k, 1], places[k, 2]
+            _, nx, ny, nz = distance_with_gradient(field, pose, x, y, z)
+            out[b, k, 0], out[b, k, 1], out[b, k, 2] = nx, ny, nz
 
 
 @compiled

@@ -17,9 +17,11 @@ from chsel.problem.noise import (
     FREEDOMS,
     LIMIT,
     NoiseModel,
+    PosedNormals,
     estimate_noise,
     noise_model,
 )
+from chsel.problem.points import KnownPoints
 from chsel.problem.poses import (
     Poses,
     compose,
@@ -37,6 +39,7 @@ from chsel.problem.surface import (
     outline_in_object,
     outline_in_world,
     signed_distances,
+    surface_gradients,
     surface_spread,
 )
 
@@ -70,6 +73,7 @@ _SOFT = 1e-4  # added to A, see motion_cost: of (m / m)^2
 _ROUNDS = 4  # of the subspace iteration
 _LEAST_LENGTH = 1e-3  # of a motion of the surface, of the object's motion
 _MOST_KNOWN, _MOST_FREE = 1000, 5000
+_LEAST_GRADIENT = 1e-12  # length of one that has a direction
 
 
 def trust_in(
@@ -433,7 +437,19 @@ def pose_energies(problem: RegistrationProblem, poses: Poses, *, noise: NoiseMod
         -signed_distances(sdf, poses, points=free),
         signed_distances(sdf, poses, points=occupied),
     ]
-    return noise.energies(residuals, np.concatenate(depths, axis=1))
+    normals = (
+        posed_normals(sdf, points.with_known(known), poses=poses) if points.has_normals else None
+    )
+    return noise.energies(residuals, np.concatenate(depths, axis=1), normals=normals)
+
+
+def posed_normals(sdf: SdfGrid, points: KnownPoints, *, poses: Poses) -> PosedNormals:
+    """Return the normals of known points beside those of the object in poses (B, 12)."""
+    gradients = surface_gradients(sdf, poses, points=points.known)
+    turned_normals = rotated(poses.rotations[:, None], points.normals)
+    lengths = np.sqrt(in_order(gradients * gradients))
+    cosines = in_order(turned_normals * gradients) / np.maximum(lengths, _LEAST_GRADIENT)
+    return PosedNormals(points.normal_noise, cosines, lengths=lengths)
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ import trimesh
 
 from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.problem.initial_sets import posed_problem
-from chsel.problem.noise import EXTENT, INDEPENDENT, LATER, SHARE
+from chsel.problem.noise import EXTENT, FACET, INDEPENDENT, SHARE, WRONG_NORMALS
 from chsel.problem.poses import apply, compose, hat, random_rotations
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.sdf_grid import SdfGrid
@@ -64,18 +64,42 @@ def box_distance(points, sides):
     return outside + np.minimum(beyond.max(axis=-1), 0.0)
 
 
-def plain_energy(noise, residuals, *, depths):
-    """E of one pose as chsel.problem.noise has it, of residuals (N,) and depths (M,), metres."""
+def normal_density(sigma, cosine, length):
+    """F of one normal as chsel.problem.noise has it; sigma: radians, 0 where there is none."""
+    if sigma == 0.0:
+        return 1.0
+    b = 0.5 / (0.5 * sigma**2 + FACET**2 + 1.0 - length)
+    right = (1.0 + 2.0 * b) ** 2 / ((1.0 + b) * (1.0 + b * (1.0 - cosine)) ** 3)
+    return (1.0 - WRONG_NORMALS) * right + WRONG_NORMALS
 
-    def density(size, sigma):
+
+def plain_energy(noise, residuals, *, depths, normals=None):
+    """E of one pose as chsel.problem.noise has it, of residuals (N,) and depths (M,), metres.
+
+    normals: of each residual the noise, radians, the cosine with the gradient, and its length.
+    """
+    normals = [(0.0, 1.0, 1.0)] * len(residuals) if normals is None else normals
+    factors = [
+        normal_density(max(s, bool(s) * noise.least_normal_noise), c, size)
+        for s, c, size in normals
+    ]
+    peaks = [
+        normal_density(max(s, bool(s) * noise.least_normal_noise), 1.0, 1.0) for s, _, _ in normals
+    ]
+
+    def density(size, sigma, factor):
         normal = math.exp(-0.5 * (size / sigma) ** 2) / (math.sqrt(2.0 * math.pi) * sigma)
-        return (1.0 - SHARE) * normal + SHARE / EXTENT
+        return (1.0 - SHARE) * normal * factor + SHARE / EXTENT
 
     power = min(1.0, INDEPENDENT / max(len(residuals), 1))
     sizes = [max(abs(r) - noise.shared, 0.0) for r in residuals]
-    best = density(0.0, noise.sigmas[0])
     logs = [
-        math.log(w) + power * sum(math.log(density(size, s) / best) for size in sizes)
+        math.log(w)
+        + power
+        * sum(
+            math.log(density(size, s, factor) / density(0.0, noise.sigmas[0], peak))
+            for size, factor, peak in zip(sizes, factors, peaks, strict=True)
+        )
         for s, w in zip(noise.sigmas, noise.weights, strict=True)
     ]
     most = max(logs)
@@ -83,8 +107,6 @@ def plain_energy(noise, residuals, *, depths):
         min(max(depth - noise.shared, 0.0) ** 2 / (2.0 * noise.softness**2), noise.wrong)
         for depth in depths
     )
-    if wrong > noise.wrong:
-        wrong = noise.wrong + LATER * (wrong - noise.wrong)
     return -most - math.log(sum(math.exp(one - most) for one in logs)) + power * wrong
 
 
@@ -92,13 +114,16 @@ def plain_energies(noise, sdf, *, points, poses):
     """The same (B,) of poses, by distances between the nodes of a grid."""
     energies = []
     for pose in poses.matrices:
-        known, free, occupied = (
-            sdf.at(apply(pose, group), lookup="trilinear")[0]
+        (known, gradients), (free, _), (occupied, _) = (
+            sdf.at(apply(pose, group), lookup="trilinear")
             for group in (points.known, points.free, points.occupied)
         )
+        lengths = np.linalg.norm(gradients, axis=1)
+        along = (points.normals @ pose[:3, :3].T * gradients).sum(axis=1)
+        normals = [*zip(points.normal_noise, along / lengths, lengths, strict=True)]
         depths = np.concatenate([-free, occupied])
         wrong = depths[depths > 0.0]  # others cost nothing
-        energies.append(plain_energy(noise, known - points.sdf, depths=wrong))
+        energies.append(plain_energy(noise, known - points.sdf, depths=wrong, normals=normals))
     return np.array(energies)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -15,61 +14,70 @@ from chsel.cost.cost_settings import CostSettings
 from chsel.cost.free_kernels import is_apart, remember
 from chsel.numerics.arrays import FloatArray, scratch
 from chsel.numerics.compiler import compiled, inner, leaf
-from chsel.numerics.elementary import exp, exps, log, logs
+from chsel.numerics.elementary import exp, log
 from chsel.numerics.near_points import NearPoints, gather, near_points_for, select, to_cells
-from chsel.numerics.pose_tuples import moved, pose_at, rigid
+from chsel.numerics.pose_tuples import moved, pose_at, rigid, turned
 from chsel.numerics.threads import parallel_for
-from chsel.problem.noise import EXTENT, LATER, SHARE, NoiseModel
+from chsel.problem.noise import EXTENT, SHARE, WRONG_NORMALS, NoiseModel
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
-from chsel.problem.sdf_lookup import cell_of, distance_at, value_between_nodes
+from chsel.problem.sdf_lookup import (
+    cell_of,
+    distance_at,
+    distance_with_gradient,
+    value_between_nodes,
+)
 
 # Where these numbers are from: docs/anchored.md, "Numbers that are no settings".
 _ROWS_PER_LEVEL = 4.0  # of tables, in the least s_k
 _BEYOND = 6.0  # of the greatest s_k: residuals beyond cost no more
 _AT_ONCE = 16  # known points between two comparisons with the limit
 _LEVELS = 8  # K of the likelihood, as kernels take constants from kernel files alone
-_LOG_LEVELS = 2.0794415416798357  # ln K
+_LEAST_PRODUCT = 1e-300  # of densities, by the largest
+_LEAST_GRADIENT = 1e-12  # length of one that has a direction
 _ALL = -1  # instead of the number of packets that were gathered
 
 
 class Likelihood(NamedTuple):
-    """A noise model as kernels read it: costs of residuals in tables, a row of K for each step."""
+    """A noise model of M known points as kernels read it."""
 
-    costs: FloatArray  # (rows K,), nats: 0 for a residual of 0 at the least noise
-    slopes: FloatArray  # (rows K,), derivatives of costs by half of the squared residual, 1/m^2
-    log_weights: FloatArray  # (K,)
+    densities: FloatArray  # (rows K,), of residuals, 1/m: a row of K for each step of them
+    precisions: FloatArray  # (K,), 1/m^2
+    weights: FloatArray  # (K,)
+    scales: FloatArray  # (M,), inverse of the greatest density of each known point, m
+    normals: FloatArray  # (3, M), of known points, world
+    variances: FloatArray  # (M,), of normals on flat faces, radians^2; 0 where there is none
+    foreign: float  # density of contacts with other objects, 1/m
     per_metre: float  # rows
     last: float  # row that can be interpolated to
     shared: float  # metres
     power: float  # t
     softness: float  # metres
     wrong: float  # nats
-    later: float  # share of costs beyond
 
 
-def likelihood_of(noise: NoiseModel, known: int) -> Likelihood:
-    """Return tables for so many known points."""
+def likelihood_of(noise: NoiseModel, known: KnownPoints) -> Likelihood:
+    """Return tables for known points, in their order."""
     step = noise.sigmas[0] / _ROWS_PER_LEVEL
     rows = int(_BEYOND * noise.sigmas[-1] / step) + 2
     sizes = step * np.arange(rows, dtype=np.float64)
-    sigmas = np.array(noise.sigmas)
-    costs = replace(noise, shared=0.0).costs(sizes)
-    peak = (1.0 - SHARE) / (math.sqrt(2.0 * math.pi) * sigmas[0])
-    foreign = SHARE / EXTENT / (peak + SHARE / EXTENT)
-    slopes = (1.0 - foreign * exps(costs)) / sigmas**2
+    densities = replace(noise, shared=0.0).densities(sizes)
+    variances = noise.normal_variances(known.normal_noise)
     return Likelihood(
-        costs=costs.reshape(rows * _LEVELS),
-        slopes=slopes.reshape(rows * _LEVELS),
-        log_weights=logs(np.array(noise.weights)),
+        densities=densities.reshape(rows * _LEVELS),
+        precisions=1.0 / np.array(noise.sigmas) ** 2,
+        weights=np.array(noise.weights),
+        scales=1.0 / noise.greatest(variances),
+        normals=known.normals.T.copy(),
+        variances=variances,
+        foreign=SHARE / EXTENT,
         per_metre=1.0 / step,
         last=rows - 1.000001,
         shared=noise.shared,
-        power=noise.power(known),
+        power=noise.power(len(known.known)),
         softness=noise.softness,
         wrong=noise.wrong,
-        later=LATER,
     )
 
 
@@ -78,7 +86,7 @@ class Scratch(NamedTuple):
 
     near: NearPoints  # the free points gathered
     memory: FloatArray  # (12,), where the object was then, see remember and travel
-    sums: FloatArray  # (K,), of costs, then posterior weights
+    levels: FloatArray  # (K,), products of densities, then posterior weights
 
 
 class Energy:
@@ -92,12 +100,12 @@ class Energy:
         side = problem.free_resolution
         self._cost = CompiledCost(problem.sdf, known, settings=settings, free_resolution=side)
         self._sdf = problem.sdf
-        self._count = len(known.known)
+        self._known = known
         self._set(noise)
 
     def _set(self, noise: NoiseModel) -> None:
         self.model: Model = self._cost.at_level(self._sdf, -noise.shared)
-        self.likelihood = likelihood_of(noise, self._count)
+        self.likelihood = likelihood_of(noise, self._known)
 
     def by(self, noise: NoiseModel) -> Energy:
         """Return the energy by another noise model."""
@@ -108,7 +116,7 @@ class Energy:
     def scratch(self) -> Scratch:
         """Return scratch of one thread."""
         near = near_points_for(self.model.free.tree, 1)
-        return Scratch(near, scratch(12), sums=scratch(_LEVELS))
+        return Scratch(near, scratch(12), levels=scratch(_LEVELS))
 
     def of(self, poses: Poses) -> FloatArray:
         """Return energies (B,) of poses."""
@@ -126,45 +134,80 @@ def energies_of(model, likelihood, poses, out, first, last, work):
     """Fill out (B,) with the energies of poses (B, 12), from `first` to before `last`."""
     for n in range(first, last):
         pose = pose_at(poses, n)
-        known = known_energy(model, likelihood, pose, np.inf, work.sums)
+        known = known_energy(model, likelihood, pose, np.inf, work.levels)
         gather_free(model, pose, 0.0, work)
-        out[n] = energy_below(model, likelihood, pose, known, np.inf, work)[0]
+        out[n] = energy_below(model, likelihood, pose, known, np.inf, work)
 
 
 @leaf
-def known_energy(model, likelihood, pose, limit, sums):
+def known_energy(model, likelihood, pose, limit, levels):
     """Return the energy of known points; infinite if it is surely above a limit.
 
-    sums (K,) become the posterior weights of the levels.
+    levels (K,) become the posterior weights of the levels of noise.
     """
-    field = model.field
     known = model.known
-    levels = np.uint64(_LEVELS)
-    costs, count = likelihood.costs, known.shape[1]
-    for k in range(levels):
-        sums[k] = 0.0
+    table, foreign, power = likelihood.densities, likelihood.foreign, likelihood.power
+    count, size = known.shape[1], np.uint64(_LEVELS)
+    offset = 0.0
+    for k in range(size):
+        levels[k] = 1.0
     for first in range(0, count, _AT_ONCE):
         for n in range(first, min(first + _AT_ONCE, count)):
-            s = distance_at(field, pose, known[0, n], known[1, n], known[2, n])
+            point = known[0, n], known[1, n], known[2, n]
+            s, factor = distance_and_factor(model, likelihood, pose, n, point)
             at, part = _row(likelihood, s - model.known_sdf[n])
-            for k in range(levels):
-                low = costs[at + k]
-                sums[k] += low + part * (costs[at + levels + k] - low)
-        least = np.inf
-        for k in range(levels):
-            least = min(least, likelihood.power * sums[k] - likelihood.log_weights[k])
-        if least - _LOG_LEVELS > limit:  # costs are not negative
+            scale = likelihood.scales[n]
+            for k in range(size):
+                low = table[at + k]
+                density = low + part * (table[at + size + k] - low)
+                levels[k] *= scale * (density * factor + foreign)
+        largest = 0.0
+        for k in range(size):
+            largest = max(largest, levels[k])
+        offset -= power * log(largest)
+        if offset > limit:  # densities are at most 1 by their scales
             return np.inf
-    least, total = np.inf, 0.0
-    for k in range(levels):
-        sums[k] = likelihood.power * sums[k] - likelihood.log_weights[k]
-        least = min(least, sums[k])
-    for k in range(levels):
-        sums[k] = exp(least - sums[k])
-        total += sums[k]
-    for k in range(levels):
-        sums[k] /= total
-    return least - log(total)
+        for k in range(size):
+            levels[k] /= largest
+    total = 0.0
+    for k in range(size):
+        if power < 1.0:
+            levels[k] = exp(power * log(max(levels[k], _LEAST_PRODUCT)))
+        levels[k] *= likelihood.weights[k]
+        total += levels[k]
+    for k in range(size):
+        levels[k] /= total
+    return offset - log(total)
+
+
+@leaf
+def distance_and_factor(model, likelihood, pose, n, point):
+    """Return the signed distance at the n-th known point, and the factor F of its normal."""
+    if likelihood.variances[n] == 0.0:
+        return distance_at(model.field, pose, point[0], point[1], point[2]), 1.0
+    looked_up = distance_with_gradient(model.field, pose, point[0], point[1], point[2])
+    return looked_up[0], normal_beside(likelihood, pose, n, looked_up)[0]
+
+
+@leaf
+def normal_beside(likelihood, pose, n, looked_up):
+    """Return F, and the derivative of -log F by 1 - cos, for the n-th known point's normal.
+
+    looked_up: distance and gradient there. Then the normal, and the gradient's direction, in the
+    object's frame.
+    """
+    _, x, y, z = looked_up
+    length = np.sqrt(x * x + y * y + z * z)
+    unit = 1.0 / max(length, _LEAST_GRADIENT)
+    x, y, z = x * unit, y * unit, z * unit
+    normals = likelihood.normals
+    u, v, w = turned(pose, normals[0, n], normals[1, n], normals[2, n])
+    b = 0.5 / (likelihood.variances[n] + max(1.0 - length, 0.0))
+    off = 1.0 + b * (1.0 - (u * x + v * y + w * z))
+    peak = 1.0 + 2.0 * b
+    density = (1.0 - WRONG_NORMALS) * peak * peak / ((1.0 + b) * (off * off * off))
+    factor = density + WRONG_NORMALS
+    return factor, density / factor * 3.0 * b / off, (u, v, w), (x, y, z)
 
 
 @leaf
@@ -177,65 +220,61 @@ def _row(likelihood, residual):
 
 
 @leaf
-def known_slope(likelihood, residual, weights):
-    """Return the derivative of the energy by half of a squared residual; weights: of the levels."""
+def known_slope(likelihood, residual, factor, levels):
+    """Return the derivative of the energy by half of a squared residual, and of log F.
+
+    levels: posterior weights. The second one is minus the chance that it is on the object.
+    """
     at, part = _row(likelihood, residual)
-    slopes = likelihood.slopes
-    levels = np.uint64(_LEVELS)
-    total = 0.0
-    for k in range(levels):
-        low = slopes[at + k]
-        total += weights[k] * (low + part * (slopes[at + levels + k] - low))
-    return likelihood.power * total
+    table, size = likelihood.densities, np.uint64(_LEVELS)
+    slope = 0.0
+    chance = 0.0
+    for k in range(size):
+        low = table[at + k]
+        density = factor * (low + part * (table[at + size + k] - low))
+        share = levels[k] * density / (density + likelihood.foreign)
+        chance += share
+        slope += share * likelihood.precisions[k]
+    return likelihood.power * slope, likelihood.power * chance
 
 
 @leaf
-def _depth_cost(likelihood, depth):
-    """Return the cost of a free or occupied point so deep on the wrong side, metres."""
+def _depth_energy(likelihood, depth):
+    """Return the energy of a free or occupied point so deep on the wrong side, metres."""
     ratio = depth / likelihood.softness
-    return min(0.5 * ratio * ratio, likelihood.wrong)
+    return likelihood.power * min(0.5 * ratio * ratio, likelihood.wrong)
 
 
 @leaf
-def _depth_energy(likelihood, costs):
-    """Return the energy of all points on the wrong side, whose costs have this sum."""
-    beyond = likelihood.later * (costs - likelihood.wrong)
-    return likelihood.power * min(costs, likelihood.wrong + beyond)
-
-
-@leaf
-def depth_slope(likelihood, depth, costs):
-    """Return the derivative of _depth_energy by half of one squared depth."""
+def depth_slope(likelihood, depth):
+    """Return the derivative of _depth_energy by half of the squared depth."""
     ratio, softness = depth / likelihood.softness, likelihood.softness
     if 0.5 * ratio * ratio >= likelihood.wrong:
         return 0.0
-    share = 1.0 if costs <= likelihood.wrong else likelihood.later
-    return share * likelihood.power / (softness * softness)
+    return likelihood.power / (softness * softness)
 
 
 @leaf
 def energy_below(model, likelihood, pose, known, limit, work):
     """Return an energy of known points plus that of occupied and of gathered free ones.
 
-    It is infinite above a limit. Also return the sum of the costs of the latter.
+    It is infinite above a limit.
     """
     occupied = model.occupied
     table = model.field.table
-    costs = 0.0
+    total = known
     for n in range(occupied.shape[1]):
         s = distance_at(model.field, pose, occupied[0, n], occupied[1, n], occupied[2, n])
-        costs += _depth_cost(likelihood, max(s + model.alpha, 0.0))
+        total += _depth_energy(likelihood, max(s + model.alpha, 0.0))
     across, along = np.int64(model.field.box.across), np.int64(model.field.box.along)
-    total = known + _depth_energy(likelihood, costs)
     for n in range(look_around(model, pose, work)):
         if not total <= limit:
             break
         cell, u, v, w = free_cell(model, pose, free_point(model, work, n))
         if cell >= 0:
             s = value_between_nodes(table, cell, across, along, u, v, w)
-            costs += _depth_cost(likelihood, max(model.alpha - s, 0.0))
-            total = known + _depth_energy(likelihood, costs)
-    return total if total <= limit else np.inf, costs
+            total += _depth_energy(likelihood, max(model.alpha - s, 0.0))
+    return total if total <= limit else np.inf
 
 
 @inner

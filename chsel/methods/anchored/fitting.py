@@ -23,6 +23,7 @@ from chsel.methods.anchored.energy import (
     known_energy,
     known_slope,
     look_around,
+    normal_beside,
 )
 from chsel.numerics.arrays import FloatArray, scratch
 from chsel.numerics.cell_set import triple
@@ -115,9 +116,9 @@ def _fitted(model, likelihood, twists, pose, steps, fit):
     """Return a pose after up to so many steps that lower its energy."""
     dimension, damping = len(twists.basis), _FIRST_DAMPING
     gather_free(model, pose, _SLACK, fit.work)
-    known = known_energy(model, likelihood, pose, np.inf, fit.work.sums)
-    energy, costs = energy_below(model, likelihood, pose, known, np.inf, fit.work)
-    _linearise(model, likelihood, twists, pose, costs, fit)
+    known = known_energy(model, likelihood, pose, np.inf, fit.work.levels)
+    energy = energy_below(model, likelihood, pose, known, np.inf, fit.work)
+    _linearise(model, likelihood, twists, pose, fit)
     for _ in range(steps):
         trace = 0.0
         for i in range(dimension):
@@ -127,15 +128,15 @@ def _fitted(model, likelihood, twists, pose, steps, fit):
         trial = _moved_by(twists, pose, fit)
         if travel(model.free, trial, fit.work.memory) > _SLACK:
             gather_free(model, trial, _SLACK, fit.work)
-        known = known_energy(model, likelihood, trial, energy, fit.work.sums)
-        tried, costs = energy_below(model, likelihood, trial, known, energy, fit.work)
+        known = known_energy(model, likelihood, trial, energy, fit.work.levels)
+        tried = energy_below(model, likelihood, trial, known, energy, fit.work)
         if tried < energy:
             gain = energy - tried
             pose, energy = trial, tried
             damping *= _LESS
             if gain < _ENOUGH * tried:
                 break
-            _linearise(model, likelihood, twists, pose, costs, fit)
+            _linearise(model, likelihood, twists, pose, fit)
         else:
             damping *= _MORE
             if damping > _MOST_DAMPING:
@@ -144,8 +145,8 @@ def _fitted(model, likelihood, twists, pose, steps, fit):
 
 
 @inner
-def _linearise(model, likelihood, twists, pose, costs, fit):
-    """Fill the normal equations at a pose; costs: of free and occupied points, see energy_below."""
+def _linearise(model, likelihood, twists, pose, fit):
+    """Fill the normal equations at a pose."""
     field = model.field
     sums = fit.sums
     work = fit.work
@@ -156,7 +157,12 @@ def _linearise(model, likelihood, twists, pose, costs, fit):
         point = model.known[0, n], model.known[1, n], model.known[2, n]
         looked_up = distance_with_gradient(field, pose, point[0], point[1], point[2])
         residual = looked_up[0] - model.known_sdf[n]
-        slope = known_slope(likelihood, residual, work.sums)
+        factor = 1.0
+        if likelihood.variances[n] > 0.0:
+            factor, bend, normal, gradient = normal_beside(likelihood, pose, n, looked_up)
+            chance = known_slope(likelihood, residual, factor, work.levels)[1]
+            _add_normal(sums, normal, gradient, chance * bend)
+        slope = known_slope(likelihood, residual, factor, work.levels)[0]
         _add(sums, twists.pivot, pose, point, looked_up, residual, slope)
     for n in range(look_around(model, pose, work)):
         point = free_point(model, work, n)
@@ -165,14 +171,14 @@ def _linearise(model, likelihood, twists, pose, costs, fit):
             looked_up = distance_between_nodes(field.box, field.table, cell, u, v, w)
             depth = model.alpha - looked_up[0]
             if depth > 0.0:
-                slope = depth_slope(likelihood, depth, costs)
+                slope = depth_slope(likelihood, depth)
                 _add(sums, twists.pivot, pose, point, looked_up, -depth, slope)
     for n in range(model.occupied.shape[1]):
         point = model.occupied[0, n], model.occupied[1, n], model.occupied[2, n]
         looked_up = distance_with_gradient(field, pose, point[0], point[1], point[2])
         height = looked_up[0] + model.alpha
         if height > 0.0:
-            slope = depth_slope(likelihood, height, costs)
+            slope = depth_slope(likelihood, height)
             _add(sums, twists.pivot, pose, point, looked_up, height, slope)
     _restrict(twists, fit)
 
@@ -191,6 +197,22 @@ def _add(sums, pivot, pose, point, looked_up, residual, weight):
         sums[6, i] += weighted * residual
         for j in range(i + 1):
             sums[i, j] += weighted * rates[j]
+
+
+@leaf
+def _add_normal(sums, normal, gradient, weight):
+    """Add weight (1 - m . g), half of |m - g|^2, for a normal m and a gradient g of length 1."""
+    a, b, c = normal
+    x, y, z = gradient
+    sums[6, 0] -= weight * (b * z - c * y)
+    sums[6, 1] -= weight * (c * x - a * z)
+    sums[6, 2] -= weight * (a * y - b * x)
+    sums[0, 0] += weight * (1.0 - a * a)
+    sums[1, 1] += weight * (1.0 - b * b)
+    sums[2, 2] += weight * (1.0 - c * c)
+    sums[1, 0] -= weight * a * b
+    sums[2, 0] -= weight * a * c
+    sums[2, 1] -= weight * b * c
 
 
 @inner

@@ -32,6 +32,7 @@ from chsel.qd.selection import ranked, sized_archive
 _LEAST_SCORED = 3  # contacts that stay in the score of samples if one is left out
 _ROUGH_SOFTNESS = 0.01  # metres that the border of a free voxel is off, in the rough fit
 _ROUGH_WRONG = 50.0  # nats that a free voxel costs at most, in the rough fit
+_ROUGH_NORMALS = 0.7  # radians that normals are off, in the rough fit
 _LIKELY = 6.3  # nats above the lowest energy of minima that walks start from
 
 
@@ -127,6 +128,7 @@ class Search:
             weights=(1.0 / LEVELS,) * LEVELS,
             softness=_ROUGH_SOFTNESS,
             wrong=_ROUGH_WRONG,
+            least_normal_noise=_ROUGH_NORMALS,
         )
         poses = fitted(
             self.energy.by(rough), self._twists, poses=starts, steps=self._effort.first_steps

@@ -134,14 +134,14 @@ def walk_below(model, likelihood, stride, floor, chains, stream, moves, first, l
             trial = _proposed(model, stride, pose, size, drawn[at : at + _DRAWS])
             accepted = False
             if origin_within(trial, stride.lower, stride.upper):
-                total = known_energy(model, likelihood, trial, limit, work.sums)
+                total = known_energy(model, likelihood, trial, limit, work.levels)
                 if total <= limit:
                     wanted = _slack_for(size)
                     far = slack < 0.0 or travel(model.free, trial, work.memory) > slack
                     if far or slack > _TOO_MUCH * wanted:
                         slack = wanted
                         gather_free(model, trial, slack, work)
-                    total = energy_below(model, likelihood, trial, total, limit, work)[0]
+                    total = energy_below(model, likelihood, trial, total, limit, work)
                     accepted = total <= limit
             if accepted:
                 pose, energy = trial, total
