@@ -32,7 +32,7 @@ from chsel.qd.selection import ranked, sized_archive
 _LEAST_SCORED = 3  # contacts that stay in the score of samples if one is left out
 _ROUGH_SOFTNESS = 0.01  # metres that the border of a free voxel is off, in the rough fit
 _ROUGH_WRONG = 50.0  # nats that a free voxel costs at most, in the rough fit
-_ROUGH_NORMALS = 0.7  # radians that normals are off, in the rough fit
+_ROUGH_NORMALS = 0.5  # radians that normals are off, in the rough fit
 _LIKELY = 6.3  # nats above the lowest energy of minima that walks start from
 
 
