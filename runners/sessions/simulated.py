@@ -16,6 +16,7 @@ from chsel.problem.poses import apply, compose, inverse
 from runners.sessions.configurations import Configuration
 from runners.sessions.faults import probed_mesh
 from runners.sessions.gripper import START, Touch
+from runners.sessions.mesh_surface import MeshSurface
 from runners.sessions.physics_engine import connect, silent
 from runners.sessions.placement import centre_of_mass, laid_down, lowest, on_stand
 from runners.sessions.probing_hand import ProbingHand, turned_from_forward
@@ -69,6 +70,8 @@ class PyBulletEngine:
                     self._world, probed, folder=Path(folder), kind=settings.collision_mesh
                 )
                 concave = settings.collision_mesh == "visual"
+                self._mesh = probed
+                self._surface = MeshSurface(probed, self.world_from_object)
                 self._object = _fixed_object(
                     self._world, file, world_from_object=self.world_from_object, concave=concave
                 )
@@ -98,8 +101,11 @@ class PyBulletEngine:
         if self._began is None or touching < ENOUGH_READINGS:
             return Touch(position, force)
         # As the hand presses on, the engine's contact wanders over the faces that touch by some
-        # millimetres; where the touch began is known best.
-        return Touch(position, force, contact=self._began.contact, normal=self._began.normal)
+        # millimetres; where the touch began is known best. Its normals are the hand's where that
+        # meets an edge, or across both edges where two meet.
+        contact = self._began.contact
+        normal = self._surface.closest(contact[None])[2][0]
+        return Touch(position, force, contact=contact, normal=normal)
 
     def place(self, pose: FloatArray) -> bool:
         """Put the hand at a pose (4, 4); False, and not to be used, if the object is there."""
@@ -116,6 +122,7 @@ class PyBulletEngine:
     def move(self, world_from_object: FloatArray) -> None:
         """Put the object at a pose (4, 4)."""
         self.world_from_object = world_from_object
+        self._surface = MeshSurface(self._mesh, world_from_object)
         position, quaternion = _placed(world_from_object).values()
         self._world.resetBasePositionAndOrientation(self._object, position, quaternion)
 
@@ -133,13 +140,12 @@ class PyBulletEngine:
         forces = [record[_FORCE] * np.array(record[_NORMAL_ON_B]) for record in records]
         total = np.sum(forces, axis=0)
         hardest = max(records, key=lambda record: record[_FORCE])
-        contact, normal = np.array(hardest[_POINT_ON_B]), np.array(hardest[_NORMAL_ON_B])
-        return _Reading(contact, normal, force=float(np.sqrt(total @ total)))
+        contact = np.array(hardest[_POINT_ON_B])
+        return _Reading(contact, force=float(np.sqrt(total @ total)))
 
 
 class _Reading(NamedTuple):
     contact: FloatArray  # (3,), on the object
-    normal: FloatArray  # (3,), out of it
     force: float  # on the hand, newtons
 
 
