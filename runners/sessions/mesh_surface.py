@@ -9,6 +9,10 @@ import trimesh
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
 
+_SAME = (
+    1e-4  # m: faces that are no farther from a point than this beyond the nearest one meet there
+)
+
 
 class MeshSurface:
     """Exact signed distance to a fixed mesh in the world, its search tree built only once.
@@ -52,3 +56,16 @@ class MeshSurface:
         normals[corner] = self._corner_normals[self._faces[face[corner], heaviest]]
         outside = ((points - nearest) * normals).sum(axis=1) >= 0.0
         return np.where(outside, 1.0, -1.0) * np.sqrt(squared), nearest, self._face_normals[face]
+
+    def facing_normal(self, point: FloatArray, direction: FloatArray) -> FloatArray:
+        """Return the normal (3,) of the face nearest to a point (3,).
+
+        Where faces meet, it is that of the one that faces most along a direction (3,).
+        """
+        triangles = self._vertices[self._faces]
+        points = np.broadcast_to(point, (len(triangles), 3))
+        nearest = trimesh.triangles.closest_point(triangles, points)
+        distance = np.sqrt(((nearest - point) ** 2).sum(axis=1))
+        normals = self._face_normals[distance <= distance.min() + _SAME]
+        facing: FloatArray = normals[np.argmax((normals * direction).sum(axis=1))]
+        return facing

@@ -55,6 +55,7 @@ class PyBulletEngine:
         self._max_force = settings.max_force
         self._readings: deque[_Reading | None] = deque(maxlen=READINGS)
         self._began: _Reading | None = None
+        self._normal = np.zeros(3)  # of the object's face where the touch began
         self._world: Any = connect(
             "use session=kinematic, the same session without a physics engine"
         )
@@ -93,6 +94,8 @@ class PyBulletEngine:
             reading = self._read()
             if reading is not None and not any(self._readings):
                 self._began = reading
+                # The engine's is the hand's where that meets an edge, or across both edges.
+                self._normal = self._surface.facing_normal(reading.contact, reading.normal)
             self._readings.append(reading)
             if step == FORCE_STEP and reading is not None:
                 force = reading.force
@@ -101,11 +104,8 @@ class PyBulletEngine:
         if self._began is None or touching < ENOUGH_READINGS:
             return Touch(position, force)
         # As the hand presses on, the engine's contact wanders over the faces that touch by some
-        # millimetres; where the touch began is known best. Its normals are the hand's where that
-        # meets an edge, or across both edges where two meet.
-        contact = self._began.contact
-        normal = self._surface.closest(contact[None])[2][0]
-        return Touch(position, force, contact=contact, normal=normal)
+        # millimetres; where the touch began is known best.
+        return Touch(position, force, contact=self._began.contact, normal=self._normal)
 
     def place(self, pose: FloatArray) -> bool:
         """Put the hand at a pose (4, 4); False, and not to be used, if the object is there."""
@@ -140,12 +140,13 @@ class PyBulletEngine:
         forces = [record[_FORCE] * np.array(record[_NORMAL_ON_B]) for record in records]
         total = np.sum(forces, axis=0)
         hardest = max(records, key=lambda record: record[_FORCE])
-        contact = np.array(hardest[_POINT_ON_B])
-        return _Reading(contact, force=float(np.sqrt(total @ total)))
+        contact, normal = np.array(hardest[_POINT_ON_B]), np.array(hardest[_NORMAL_ON_B])
+        return _Reading(contact, normal, force=float(np.sqrt(total @ total)))
 
 
 class _Reading(NamedTuple):
     contact: FloatArray  # (3,), on the object
+    normal: FloatArray  # (3,), across what touches, from the object to the hand
     force: float  # on the hand, newtons
 
 
