@@ -37,7 +37,7 @@ from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.sections import short_tables
 from runners.reporting.tables import print_table
 from runners.run.setup import PresetName
-from runners.sessions.faults import CLEAN, LEVELS
+from runners.sessions.faults import CLEAN, LEVELS, LEVELS_OF_POINTS
 from runners.sessions.probing_settings import without_defaults
 
 
@@ -90,7 +90,10 @@ def main(config: DictConfig) -> None:
         reason = f"true poses are sought in logs, and the session is {plan.kind}"
         require_used("truth", reason=reason, accepted=f"session={SENSORS} with it")
     levels = chosen_names(
-        "faults", checked.faults, existing=[CLEAN] if plan.kind == SENSORS else LEVELS
+        "faults",
+        checked.faults,
+        existing=[CLEAN] if plan.kind == SENSORS else LEVELS,
+        every=[CLEAN] if plan.kind == SENSORS else LEVELS_OF_POINTS,
     )
     clean = {name: one.object for name, one in plan.configurations.items() if one.faults == CLEAN}
     chosen = chosen_names("configurations", checked.configurations, existing=clean, objects=clean)

@@ -115,16 +115,25 @@ def _object_file(path: Path) -> Mapping[str, Any]:
 
 
 def chosen_names(
-    setting: str, value: Any, *, existing: Iterable[str], objects: Mapping[str, str] | None = None
+    setting: str,
+    value: Any,
+    *,
+    existing: Iterable[str],
+    every: Iterable[str] | None = None,
+    objects: Mapping[str, str] | None = None,
 ) -> tuple[str, ...]:
     """Return the existing names that a setting chooses, in the order of all of them.
 
-    A name, an object, a pattern such as noise_*, "all", or a list of these. objects: by name.
+    A name, an object, a pattern such as noise_*, "all", or a list of these. every: the names that
+    "all" chooses; None for all existing ones. objects: by name.
     """
     names = list(existing)
     chosen = set()
     for text in map(str, _listed(setting, value)):
-        named = names if text == "all" else [name for name in names if name == text]
+        if text == "all":
+            named = names if every is None else list(every)
+        else:
+            named = [name for name in names if name == text]
         named = named or [name for name in names if (objects or {}).get(name) == text]
         named = named or [name for name in names if fnmatchcase(name, text)]
         if not named:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +12,7 @@ import numpy as np
 from chsel.errors import SettingError
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import FreeVoxels, Workspace
-from chsel.problem.poses import apply, inverse
+from chsel.problem.poses import apply, axis_angle, inverse, rotated, rotation_vector
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import Check, CheckedSettings, between
 from chsel.problem.streams import Purpose, StreamKey, normals, uniforms
@@ -24,7 +25,8 @@ _OFF = 0.01  # m: nor to the object
 _TRIES = 64  # places that are looked at for a foreign contact
 _NEIGHBOURS = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1)]) - 1  # (26, 3)
 # Random streams of a step; those of the session are of step 0.
-_OF_SESSION, _OF_NOISE, _OF_FOREIGN, _OF_FREE = range(4)
+_OF_SESSION, _OF_NOISE, _OF_FOREIGN, _OF_FREE, _OF_TILT, _OF_NORMALS, _OF_WRONG = range(7)
+_OF_NORMAL_FAULTS = ("normal_noise", "normal_wrong", "normal_tilt")
 
 
 def number_between(low: float, high: float, *, unit: str = "") -> Check:
@@ -42,7 +44,8 @@ class FaultSettings(CheckedSettings):
     """Faults of what a source reports; by default none.
 
     Contacts get foreign ones beside them, are shifted by the camera's bias, get noise, and are
-    rounded, in this order. The path of the hand and its true contacts do not depend on these.
+    rounded, in this order. Normals get noise, some are replaced, and all are tilted. The path of
+    the hand and its true contacts do not depend on these.
     """
 
     # m: standard deviation of contacts along each axis, so along the normal, too.
@@ -62,6 +65,30 @@ class FaultSettings(CheckedSettings):
     camera_bias: Annotated[float, between(0.0, 0.1)] = 0.0
     # Size of the registered mesh by that of the probed one, about the centre of its bounding box.
     mesh_scale: Annotated[float, number_between(0.5, 2.0)] = 1.0
+    # Radians: contacts are reported with normals, and this as the root mean square of their angle
+    # to the true ones, whatever it is. None: without normals.
+    normals: Annotated[float | None, number_between(0.001, math.pi, unit=" radians")] = None
+    # Radians: the true root mean square of that angle.
+    normal_noise: Annotated[float, number_between(0.0, 1.0, unit=" radians")] = 0.0
+    # Share of true contacts whose normal has any direction.
+    normal_wrong: Annotated[float, number_between(0.0, 1.0)] = 0.0
+    # Radians: by which all normals are turned, about one axis of the world for the session.
+    normal_tilt: Annotated[float, number_between(0.0, math.pi, unit=" radians")] = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        faulty = [name for name in _OF_NORMAL_FAULTS if getattr(self, name) != 0.0]
+        if self.normals is None and faulty:
+            raise SettingError(
+                f"{faulty[0]} is {getattr(self, faulty[0])}, and contacts have no normals; "
+                "accepted with it: normals, the noise stated of them, such as 0.25 radians"
+            )
+
+
+def _with_normals(degrees: float, **others: float) -> FaultSettings:
+    """Return faults with normals off by so much, which is stated unless others have `normals`."""
+    noise = math.radians(degrees)
+    return FaultSettings(**{"normals": noise, "normal_noise": noise, **others})
 
 
 CLEAN = "clean"
@@ -85,8 +112,17 @@ LEVELS: Mapping[str, FaultSettings] = {
         camera_bias=0.002,
         mesh_scale=1.01,
     ),
+    "normals_10deg": _with_normals(10.0),
+    "normals_10deg_noise_3mm": _with_normals(10.0, contact_noise=0.003),
+    "normals_10deg_foreign_10": _with_normals(10.0, foreign_contacts=0.1),
+    "normals_20deg": _with_normals(20.0),
+    "normals_20deg_as_5deg": _with_normals(20.0, normals=math.radians(5.0)),
+    "normals_tilt_15deg": _with_normals(10.0, normal_tilt=math.radians(15.0)),
+    "normals_wrong_30": _with_normals(10.0, normal_wrong=0.3),
 }
 """Named faults, which `session/faults=NAME` and evaluations choose."""
+LEVELS_OF_POINTS = tuple(name for name, level in LEVELS.items() if level.normals is None)
+"""Levels without normals, which `all` names in evaluations."""
 
 
 def level_name(faults: FaultSettings) -> str:
@@ -132,6 +168,9 @@ class Faults:
         stream = StreamKey(seed, 0).stream(Purpose.FAULTS, _OF_SESSION)
         self._bias = settings.camera_bias * _directions(stream, 1)[0]  # (3,), world
         self._phase = float(uniforms(stream, 0.0, upper=1.0, shape=1)[0])
+        stream = StreamKey(seed, 0).stream(Purpose.FAULTS, _OF_TILT)
+        self._tilt = axis_angle(_directions(stream, 1)[0], settings.normal_tilt)
+        self._wrong_phase = float(uniforms(stream, 0.0, upper=1.0, shape=1)[0])
         self._true = self._foreign = 0  # numbers of contacts so far
         self._drawn: set[bytes] = set()  # voxels inside the object that had their chance
 
@@ -146,7 +185,21 @@ class Faults:
         side = self._settings.quantisation
         if side > 0.0:
             contacts = np.rint(contacts / side) * side
+        if self._settings.normals is not None:
+            normals_out = rotated(self._tilt, self._noisy_normals(step, normals_out))
+            others = rotated(self._tilt, others)
         return contacts, np.concatenate([normals_out, others])
+
+    def _noisy_normals(self, step: int, true: FloatArray) -> FloatArray:
+        """Return normals (C, 3) of the last true contacts with noise, some of any direction."""
+        drawn = normals(self._stream(step, _OF_NORMALS), true.shape)
+        across = drawn - (drawn * true).sum(axis=1, keepdims=True) * true
+        turns = self._settings.normal_noise / math.sqrt(2.0) * across  # (C, 3), rotation vectors
+        found = rotated(rotation_vector(turns), true)
+        numbers = self._true - len(true) + np.arange(len(true) + 1)
+        wrong_so_far = np.floor(numbers * self._settings.normal_wrong + self._wrong_phase)
+        anywhere = _directions(self._stream(step, _OF_WRONG), len(true))
+        return np.where(np.diff(wrong_so_far)[:, None] > 0.0, anywhere, found)
 
     def wrongly_free(self, step: int, swept: FloatArray) -> FloatArray:
         """Return centres (N', 3) of voxels in the object reported free beside swept ones (N, 3).

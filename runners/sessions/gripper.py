@@ -38,7 +38,7 @@ class Touch:
     """Point (3,) on the object's surface, world; None without contact."""
 
     normal: FloatArray | None = None
-    """Normal (3,) out of the object at the contact."""
+    """Normal (3,) out of the object's face at the contact; on an edge, of one of its faces."""
 
 
 class Engine(Protocol):

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-import igl
 import numpy as np
 import trimesh
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Lattice
-from chsel.problem.poses import apply
 from runners.sessions.gripper import START, Touch
+from runners.sessions.mesh_surface import MeshSurface
 from runners.sessions.probing_hand import ProbingHand, turned_from_forward
 from runners.sessions.probing_settings import ProbingSettings
 
@@ -45,7 +44,7 @@ class KinematicEngine:
     def move(self, world_from_object: FloatArray) -> None:
         """Put the object at a pose (4, 4)."""
         self.world_from_object = world_from_object
-        self._object = _Surface(self._mesh, world_from_object)
+        self._object = MeshSurface(self._mesh, world_from_object)
         self._clearance[:] = 0.0
 
     def advance(self, target: FloatArray) -> Touch:
@@ -131,43 +130,3 @@ def _patches(hand: ProbingHand) -> _Patches:
     radii = np.zeros(len(centres))
     np.maximum.at(radii, labels, np.sqrt(((points - centres[labels]) ** 2).sum(axis=1)))
     return _Patches(points, labels, centres=centres, radii=radii)
-
-
-class _Surface:
-    """Exact signed distance to a fixed mesh in the world, its search tree built only once.
-
-    The sign is that of the pseudonormal of the nearest face, edge or corner, which needs no more
-    than the surface around it.
-    """
-
-    def __init__(self, mesh: trimesh.Trimesh, world_from_object: FloatArray) -> None:
-        self._vertices = np.ascontiguousarray(apply(world_from_object, np.asarray(mesh.vertices)))
-        self._faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
-        self._tree = igl.AABB()
-        self._tree.init(self._vertices, self._faces)
-        rotation = world_from_object[:3, :3].T
-        self._face_normals = np.asarray(mesh.face_normals) @ rotation
-        self._corner_normals = np.asarray(mesh.vertex_normals) @ rotation
-        neighbours, _ = igl.triangle_triangle_adjacency(self._faces)
-        across = np.where(neighbours[..., None] < 0, 0.0, self._face_normals[neighbours])
-        self._edge_normals = self._face_normals[:, None] + across  # by face and first corner
-
-    def distance(self, points: FloatArray) -> FloatArray:
-        """Return unsigned distance (N,) in metres at points (N, 3)."""
-        return np.sqrt(self._tree.squared_distance(self._vertices, self._faces, points)[0])
-
-    def closest(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return signed distances (N,) of points (N, 3), nearest points (N, 3), and normals."""
-        squared, face, nearest = self._tree.squared_distance(self._vertices, self._faces, points)
-        triangles = self._vertices[self._faces[face]]
-        weights = trimesh.triangles.points_to_barycentric(triangles, nearest)
-        on_side = weights < 1e-9  # of the edge opposite to this corner
-        normals = self._face_normals[face]
-        edge = on_side.sum(axis=1) == 1
-        opposite = np.argmax(on_side[edge], axis=1)
-        normals[edge] = self._edge_normals[face[edge], (opposite + 1) % 3]
-        corner = on_side.sum(axis=1) == 2
-        heaviest = np.argmax(weights[corner], axis=1)
-        normals[corner] = self._corner_normals[self._faces[face[corner], heaviest]]
-        outside = ((points - nearest) * normals).sum(axis=1) >= 0.0
-        return np.where(outside, 1.0, -1.0) * np.sqrt(squared), nearest, self._face_normals[face]

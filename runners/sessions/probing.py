@@ -262,12 +262,25 @@ class ProbingSource(Steerable):
         probe = Probe(
             step=step,
             outcome="contact" if len(contacts) else "free",
-            new_points=KnownPoints(free=free, known=contacts),
+            new_points=self._points(free, contacts=contacts, normals=normals),
             gripper_path=world_from_gripper(ends, rotation),
             contacts=contacts,
             contact_normals=normals,
         )
         return probe if probe.push is None else self._pushed(probe, probe.push)
+
+    def _points(
+        self, free: FloatArray, *, contacts: FloatArray, normals: FloatArray
+    ) -> KnownPoints:
+        """Return free points (N, 3) and contacts (C, 3), with normals (C, 3) if they are reported.
+
+        Normals of 0 are not known.
+        """
+        stated = self.settings.faults.normals
+        if stated is None:
+            return KnownPoints(free=free, known=contacts)
+        noise = np.where((normals != 0.0).any(axis=1), stated, 0.0)
+        return KnownPoints(free=free, known=contacts, normals=normals, normal_noise=noise)
 
     def _pushed(self, probe: Probe, direction: FloatArray) -> Probe:
         """Move the object in a direction (3,), unless it stands; return the probe with its pose."""

@@ -22,6 +22,12 @@ Length = Annotated[float, positive]  # m
 Force = Annotated[float, positive]  # N
 Count = Annotated[int, not_negative]
 _STANDING = (("moves", 0.0), ("expect_moves", None))  # an object that stands still
+_NO_NORMALS = (  # of faults, which came later than others
+    ("normals", None),
+    ("normal_noise", 0.0),
+    ("normal_wrong", 0.0),
+    ("normal_tilt", 0.0),
+)
 
 
 @dataclass(frozen=True)
@@ -82,6 +88,8 @@ def without_defaults(session: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings as they are recorded: some only where they are not the default."""
     defaults = {"faults": LEVELS[CLEAN], "hand": DescribedHand()}
     session = {k: v for k, v in session.items() if (k, v) not in _STANDING}
+    if isinstance(faults := session.get("faults"), Mapping):
+        session["faults"] = {k: v for k, v in faults.items() if (k, v) not in _NO_NORMALS}
     return {
         key: value
         for key, value in session.items()

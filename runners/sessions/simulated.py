@@ -16,6 +16,7 @@ from chsel.problem.poses import apply, compose, inverse
 from runners.sessions.configurations import Configuration
 from runners.sessions.faults import probed_mesh
 from runners.sessions.gripper import START, Touch
+from runners.sessions.mesh_surface import MeshSurface
 from runners.sessions.physics_engine import connect, silent
 from runners.sessions.placement import centre_of_mass, laid_down, lowest, on_stand
 from runners.sessions.probing_hand import ProbingHand, turned_from_forward
@@ -54,6 +55,7 @@ class PyBulletEngine:
         self._max_force = settings.max_force
         self._readings: deque[_Reading | None] = deque(maxlen=READINGS)
         self._began: _Reading | None = None
+        self._normal = np.zeros(3)  # of the object's face where the touch began
         self._world: Any = connect(
             "use session=kinematic, the same session without a physics engine"
         )
@@ -69,6 +71,8 @@ class PyBulletEngine:
                     self._world, probed, folder=Path(folder), kind=settings.collision_mesh
                 )
                 concave = settings.collision_mesh == "visual"
+                self._mesh = probed
+                self._surface = MeshSurface(probed, self.world_from_object)
                 self._object = _fixed_object(
                     self._world, file, world_from_object=self.world_from_object, concave=concave
                 )
@@ -90,6 +94,8 @@ class PyBulletEngine:
             reading = self._read()
             if reading is not None and not any(self._readings):
                 self._began = reading
+                # The engine's is the hand's where that meets an edge, or across both edges.
+                self._normal = self._surface.facing_normal(reading.contact, reading.normal)
             self._readings.append(reading)
             if step == FORCE_STEP and reading is not None:
                 force = reading.force
@@ -99,7 +105,7 @@ class PyBulletEngine:
             return Touch(position, force)
         # As the hand presses on, the engine's contact wanders over the faces that touch by some
         # millimetres; where the touch began is known best.
-        return Touch(position, force, contact=self._began.contact, normal=self._began.normal)
+        return Touch(position, force, contact=self._began.contact, normal=self._normal)
 
     def place(self, pose: FloatArray) -> bool:
         """Put the hand at a pose (4, 4); False, and not to be used, if the object is there."""
@@ -116,6 +122,7 @@ class PyBulletEngine:
     def move(self, world_from_object: FloatArray) -> None:
         """Put the object at a pose (4, 4)."""
         self.world_from_object = world_from_object
+        self._surface = MeshSurface(self._mesh, world_from_object)
         position, quaternion = _placed(world_from_object).values()
         self._world.resetBasePositionAndOrientation(self._object, position, quaternion)
 
@@ -139,7 +146,7 @@ class PyBulletEngine:
 
 class _Reading(NamedTuple):
     contact: FloatArray  # (3,), on the object
-    normal: FloatArray  # (3,), out of it
+    normal: FloatArray  # (3,), across what touches, from the object to the hand
     force: float  # on the hand, newtons
 
 

@@ -1,22 +1,35 @@
 """Evaluations of sessions with faults: their rows, tables and picture."""
 
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
 from chsel.errors import SettingError
 from runners import evaluate
 from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.plan import Task, Trial
-from runners.evaluation.trial_configurations import chosen_names, configurations_of
+from runners.evaluation.trial_configurations import (
+    chosen_names,
+    configurations_of,
+    faulty_name,
+)
+from runners.evaluation.trial_session import make_session, open_recorded, problems
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.figures import styles_of
 from runners.reporting.sections import tables_by_faults
 from runners.reporting.statistics import shares
-from runners.sessions.faults import LEVELS
+from runners.sessions.faults import LEVELS, LEVELS_OF_POINTS, level_name
 from tests.runners.in_process import do_task, run
 from tests.runners.made_up_evaluations import row, tables_of, write_evaluation
 from tests.runners.test_evaluation import TRIAL, plan_in
 
+CONF = Path(evaluate.__file__).parents[1] / "conf"
+OF_NORMALS = ("normal_noise", "normal_wrong", "normal_tilt")
 FAULTY = Trial(0, "mustard+noise_3mm")
 HELD = "Steps with the true pose in the set"
 
@@ -34,6 +47,45 @@ def test_configurations_and_levels_of_faults_have_names():
         "clean",
         "noise_1mm",
     )
+
+
+def test_all_levels_are_those_of_points_and_patterns_name_the_others():
+    def chosen(value):
+        return chosen_names("faults", value, existing=LEVELS, every=LEVELS_OF_POINTS)
+
+    assert chosen("all") == LEVELS_OF_POINTS
+    assert "normals_10deg" not in LEVELS_OF_POINTS
+    assert chosen("normals_2*") == ("normals_20deg", "normals_20deg_as_5deg")
+    assert chosen(["normals_10deg", "clean"]) == ("clean", "normals_10deg")
+
+
+def test_the_experiment_of_normals_has_the_same_contacts_with_and_without_them(tmp_path):
+    experiment = yaml.safe_load((CONF / "experiment" / "normals.yaml").read_text())
+    levels = chosen_names("faults", experiment["faults"], existing=LEVELS)
+    assert sorted(levels) == sorted(experiment["faults"])
+    plan = plan_in(tmp_path, steps=experiment["steps"], plausible=False)
+    plan = replace(plan, session={"kind": "kinematic", **experiment["session"]})
+    stated = {}
+    known = {}
+    truths = set()
+    for level in levels:
+        trial = Trial(0, faulty_name("mustard", level))
+        join_experiment(plan, "normals", configurations=[trial.configuration], seeds=[0])
+        make_session(plan, trial)
+        session = open_recorded(plan, trial)
+        truths.add(session.world_from_object.tobytes())
+        *_, last = problems(plan, trial, session=session)
+        assert plan.faults(trial) == level
+        stated[level] = sorted({round(math.degrees(x), 6) for x in last.points.normal_noise})
+        known[level] = last.points.known
+    assert len(truths) == 1
+    assert stated == {
+        level: [5.0] if level.endswith("as_5deg") else [10.0] if "normals" in level else [0.0]
+        for level in levels
+    }
+    for level, contacts in known.items():  # those of the same points, to the bit
+        faults = replace(LEVELS[level], normals=None, **dict.fromkeys(OF_NORMALS, 0.0))
+        np.testing.assert_array_equal(contacts, known[level_name(faults)])
 
 
 def test_without_plausible_sets_there_is_no_pd_but_the_distance_from_the_truth(tmp_path):

@@ -1,17 +1,27 @@
 """Faults on a ball: what is reported against what was met."""
 
+import math
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from chsel.errors import SettingError
-from chsel.problem.points import FreeVoxels, Lattice, Workspace
+from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
 from chsel.problem.settings import settings_mapping
 from runners.objects.loader import load_model
-from runners.sessions.faults import CLEAN, LEVELS, Faults, FaultSettings, level_name, probed_mesh
+from runners.sessions.faults import (
+    CLEAN,
+    LEVELS,
+    LEVELS_OF_POINTS,
+    Faults,
+    FaultSettings,
+    level_name,
+    probed_mesh,
+)
 from runners.sessions.probing import open_probing
 from runners.sessions.probing_settings import ProbingSettings, without_defaults
 
@@ -112,6 +122,80 @@ def test_wrongly_free_voxels_are_inside_within_reach_and_told_once(reach):
     assert len(some.wrongly_free(1, swept)) == 0  # each had its chance
 
 
+def normals_reported(count, faults, *, steps=1):
+    """True normals (C, 3), those reported of them (C, 3), and those of foreign contacts (K, 3)."""
+    true = directions(count)
+    found, foreign = [], []
+    for step, out in enumerate(np.split(true, steps)):
+        _, normals = faults.reported(step, CENTRE + RADIUS * out, normals_out=out)
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
+        found.append(normals[: len(out)])
+        foreign.append(normals[len(out) :])
+    return true, np.concatenate(found), np.concatenate(foreign)
+
+
+def angles(one, other):
+    """Angles (N,) between unit vectors (N, 3), also small ones."""
+    cosine = (one * other).sum(axis=1)
+    return np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), cosine)
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.35])
+def test_normals_are_off_by_the_noise_whatever_is_stated(noise):
+    true, found, _ = normals_reported(6000, of_ball(normals=0.1, normal_noise=noise))
+    off = angles(true, found)
+    assert np.sqrt((off**2).mean()) == pytest.approx(noise, rel=0.03)
+    # Half the lengths of two independent Gaussians are below sqrt(ln 2) of their root mean square.
+    assert (off < noise * math.sqrt(math.log(2.0))).mean() == pytest.approx(0.5, abs=0.02)
+    sideways = np.cross(true, [0.0, 0.0, 1.0])
+    sideways /= np.linalg.norm(sideways, axis=1, keepdims=True)
+    along = off / np.sin(off) * (found * sideways).sum(axis=1)  # of the turn, radians
+    assert abs(along.mean()) < 4.0 * along.std() / math.sqrt(6000)
+    assert along.std() == pytest.approx(noise / math.sqrt(2.0), rel=0.05)
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_so_many_normals_have_any_direction(share):
+    true, found, _ = normals_reported(600, of_ball(normals=0.1, normal_wrong=share), steps=200)
+    wrong = angles(true, found) > 1e-9
+    assert wrong.sum() == pytest.approx(share * 600, abs=1)
+    cosines = (true * found)[wrong].sum(axis=1)  # uniform from -1 to 1 if directions are
+    assert abs(cosines.mean()) < 4.0 / math.sqrt(3.0 * wrong.sum())
+    assert cosines.std() == pytest.approx(1.0 / math.sqrt(3.0), rel=0.1)
+    ends = np.cumsum(wrong)  # the share is kept all along
+    assert np.abs(ends - share * np.arange(1, 601)).max() <= 1.0
+
+
+def test_a_tilt_is_one_turn_of_all_normals_of_a_session():
+    turns = []
+    for seed in (0, 1):
+        faults = of_ball(normals=0.1, normal_tilt=0.26, seed=seed)
+        true, found, _ = normals_reported(40, faults, steps=8)
+        turn, residual = Rotation.align_vectors(found, true)
+        assert residual < 1e-6
+        assert turn.magnitude() == pytest.approx(0.26, abs=1e-9)
+        turns.append(turn)
+    assert (turns[0].inv() * turns[1]).magnitude() > 0.01  # another seed, another axis
+
+
+def test_faults_of_normals_change_neither_contacts_nor_each_other():
+    plain = {"contact_noise": 0.003, "foreign_contacts": 0.2, "camera_bias": 0.002}
+    contacts = reported(60, of_ball(**plain), steps=10)[1]
+    worse = {"normals": 0.1, "normal_noise": 0.2, "normal_wrong": 0.3, "normal_tilt": 0.2}
+    np.testing.assert_array_equal(contacts, reported(60, of_ball(**plain, **worse), steps=10)[1])
+    noisy = {"normals": 0.1, "normal_noise": 0.2}
+    _, alone, _ = normals_reported(60, of_ball(**noisy), steps=10)
+    _, beside, others = normals_reported(60, of_ball(**noisy, **plain), steps=10)
+    np.testing.assert_array_equal(alone, beside)
+    _, some, _ = normals_reported(60, of_ball(**noisy, normal_wrong=0.3), steps=10)
+    assert (some == alone).all(axis=1).sum() == pytest.approx(42, abs=1)
+    _, exact, foreign = normals_reported(60, of_ball(normals=0.1, **plain), steps=10)
+    np.testing.assert_array_equal(exact, directions(60))
+    np.testing.assert_array_equal(foreign, others)
+    unused = of_ball(**plain)  # as they were before sessions could report normals
+    np.testing.assert_array_equal(foreign, normals_reported(60, unused, steps=10)[2])
+
+
 def test_no_fault_reports_what_was_met_and_each_depends_on_seed_and_step():
     contacts, found = reported(20, of_ball())
     np.testing.assert_array_equal(contacts, found)
@@ -161,6 +245,32 @@ def test_a_session_with_faults_is_the_same_session():
     assert after[0].contacts[0, 0] > before[0].contacts[0, 0] + 0.002
 
 
+def test_contacts_have_normals_where_settings_state_their_noise():
+    known = {}
+    for name in ("clean", "noise_3mm", "normals_10deg", "normals_20deg_as_5deg"):
+        session, probes = kinematic(**settings_mapping(LEVELS[name]))
+        known[name] = session.initial_points.merged(
+            KnownPoints.joined([p.new_points for p in probes])
+        )
+        for probe in probes:
+            if LEVELS[name].normals is not None:
+                np.testing.assert_array_equal(probe.new_points.normals, probe.contact_normals)
+    assert not known["clean"].has_normals
+    assert not known["noise_3mm"].has_normals
+    clean, right, worse = (
+        known[name] for name in ("clean", "normals_10deg", "normals_20deg_as_5deg")
+    )
+    np.testing.assert_array_equal(clean.known, right.known)
+    np.testing.assert_array_equal(clean.free, right.free)
+    assert clean.digest != right.digest
+    assert set(right.normal_noise) == {math.radians(10.0)}
+    assert set(worse.normal_noise) == {math.radians(5.0)}
+    exact = KnownPoints.joined([p.new_points for p in kinematic(normals=0.3)[1]])
+    np.testing.assert_allclose(
+        angles(worse.normals, exact.normals) / angles(right.normals, exact.normals), 2.0
+    )  # the same turns, twice as large
+
+
 def test_levels_have_names_and_are_recorded_unless_clean():
     assert [level_name(level) for level in LEVELS.values()] == list(LEVELS)
     assert level_name(replace(LEVELS["mixed"], contact_noise=0.004)) == "own"
@@ -169,7 +279,17 @@ def test_levels_have_names_and_are_recorded_unless_clean():
     assert without_defaults(session) == {"kind": "kinematic"}
     session["faults"] = settings_mapping(LEVELS["mixed"])
     session["hand"] = {"urdf": "gripper.urdf"}
-    assert without_defaults(session) == session
+    recorded = without_defaults(session)
+    later = {"normals", "normal_noise", "normal_wrong", "normal_tilt"}  # than other faults
+    assert later.isdisjoint(recorded["faults"])
+    assert FaultSettings(**recorded.pop("faults")) == FaultSettings(**session.pop("faults"))
+    assert recorded == session
+    session["faults"] = settings_mapping(LEVELS["normals_wrong_30"])
+    recorded = without_defaults(session)["faults"]
+    assert later & set(recorded) == {"normals", "normal_noise", "normal_wrong"}
+    assert FaultSettings(**recorded) == LEVELS["normals_wrong_30"]
+    names = list(LEVELS)
+    assert list(LEVELS_OF_POINTS) == names[: names.index("mixed") + 1]
 
 
 def test_faults_that_cannot_be_are_errors():
@@ -177,8 +297,13 @@ def test_faults_that_cannot_be_are_errors():
         ("contact_noise", -0.001, "0 to 0.1 (m)"),
         ("foreign_contacts", 0.6, "0 to 0.5"),
         ("mesh_scale", 0.0, "0.5 to 2"),
+        ("normal_noise", 10.0, "0 to 1 radians"),
+        ("normals", 0.0, "0.001 to 3.14159 radians"),
     ):
         with pytest.raises(
             SettingError, match=re.escape(f"{name} is {value}; accepted: {accepted}")
         ):
             FaultSettings(**{name: value})
+    message = "normal_tilt is 0.1, and contacts have no normals; accepted with it: normals"
+    with pytest.raises(SettingError, match=message):
+        FaultSettings(normal_tilt=0.1)
