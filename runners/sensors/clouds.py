@@ -22,6 +22,7 @@ _NEAR = 2.0  # resolutions: points up to so far away give the plane of a normal
 _LEAST_NEAR = 5  # points: fewer give no plane
 _SLENDER = 0.05  # of the largest variance: points with a smaller second one are on a line
 _FLAT = 0.2  # of the second variance: points with a larger least one are on no plane
+_LEAST_FACING = 0.25  # cosine: planes steeper than 76 degrees do not say which side is seen
 _OFF_UNIT = 0.01  # by which the length of a normal that is sent may be off 1
 FARTHEST = 100.0  # m: no robot that probes an object measures rays of this length
 
@@ -171,7 +172,7 @@ def neighbour_normals(
     """Return unit normals (K, 3) at chosen ones of points (N, 3), on the side of `towards` (3,).
 
     Those of the planes of least squares through all points up to `reach` away, metres; 0 where
-    these are fewer than 5, on a line, or on no plane.
+    these are fewer than 5, on a line, on no plane, or on one that is seen from beside it.
     """
     normals = np.zeros((len(chosen), 3))
     if len(chosen) == 0:
@@ -183,7 +184,13 @@ def neighbour_normals(
         around = points[np.sort(indices)]
         around = around - around.mean(axis=0)
         variances, axes = np.linalg.eigh(around.T @ around)
-        if variances[1] > _SLENDER * variances[2] and variances[0] < _FLAT * variances[1]:
-            behind = ((towards - point) * axes[:, 0]).sum() < 0.0
-            normals[n] = -axes[:, 0] if behind else axes[:, 0]
+        normal = axes[:, 0]
+        back = towards - point
+        facing = (normal * back).sum()
+        if (
+            variances[1] > _SLENDER * variances[2]
+            and variances[0] < _FLAT * variances[1]
+            and abs(facing) > _LEAST_FACING * np.sqrt((back**2).sum())
+        ):
+            normals[n] = normal if facing > 0.0 else -normal
     return normals

@@ -33,6 +33,15 @@ def test_normals_of_a_plane_face_the_origin_of_the_sensor():
         np.testing.assert_allclose((normals**2).sum(axis=1), 1.0, rtol=1e-12)
 
 
+@pytest.mark.parametrize(("degrees", "known"), [(70.0, 400), (82.0, 0)])
+def test_a_plane_that_is_seen_from_beside_it_has_no_normal(degrees, known):
+    points, angle = plane(side=0.02), np.radians(degrees)
+    towards = 5.0 * (np.cos(angle) * TURN[:, 2] + np.sin(angle) * TURN[:, 0])
+    normals = neighbour_normals(points, np.arange(400), reach=0.02, towards=towards)
+    assert np.count_nonzero(normals @ TURN[:, 2] > 0.99) == known
+    assert np.count_nonzero(normals.any(axis=1)) == known
+
+
 def test_points_without_a_plane_have_no_normal():
     points = plane()
     towards = np.array([0.0, 0.0, 1.0])
