@@ -196,6 +196,7 @@ class ForceSensor:
         if found.miss > self._rig.reach or not self._cell.free.within(point)[0]:
             counts.outside += 1
             return None
-        along = force / np.sqrt((force**2).sum())
-        normals = rotated(world_from_sensor[:3, :3], np.stack([-found.normal, along]))
-        return _Contact(point[0], normals[0], along_force=normals[1])
+        turn = world_from_sensor[:3, :3]
+        opposite = -rotated(turn, found.normal[None])
+        along = rotated(turn, force[None] / np.sqrt((force**2).sum()))
+        return _Contact(point[0], opposite[0], along_force=along[0])
