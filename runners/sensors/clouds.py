@@ -12,7 +12,7 @@ from chsel.sensing.depth_camera import main_regions, point_regions
 from runners.sensors.cell import RobotCell, is_entered
 from runners.sensors.first_pass import FirstPass, SensorTopic
 from runners.sensors.log.messages import CloudMessage
-from runners.sensors.rig import CloudRig, has_normals
+from runners.sensors.rig import NO_NORMALS, CloudRig
 from runners.sensors.sensor import Sensed
 from runners.sensors.session_report import Counts
 from runners.sensors.surface_points import SurfacePoints
@@ -81,16 +81,8 @@ class Cloud:
             reached = free.within(points)
             points = points[reached]
             kept = self._unseen(points, counts)
-            normals = None
-            if has_normals(self._rig.normals) and message.normals is None:
-                reach = _NEAR * self._resolution
-                normals = neighbour_normals(points, kept, reach=reach, towards=origin)
-            elif has_normals(self._rig.normals) and message.normals is not None:
-                sent = message.normals[finite][reached][kept]
-                normals = self._sent_normals(sent, points[kept], pose=pose)
-            self._new.append(
-                SurfacePoints.measured(points[kept], normals=normals, degrees=self._rig.normals)
-            )
+            sent = None if message.normals is None else message.normals[finite][reached][kept]
+            self._add(points, kept, sent=sent, pose=pose)
         counts.outside += int((~reached).sum())
 
     def finish(self, step: int, counts: Counts) -> Sensed:
@@ -144,6 +136,23 @@ class Cloud:
         new = [voxel not in self._seen for voxel in voxels]
         self._seen.update(voxels)
         return first[found.kept][np.array(new, dtype=bool)]
+
+    def _add(
+        self, points: FloatArray, kept: IntArray, *, sent: FloatArray | None, pose: FloatArray
+    ) -> None:
+        """Add those of points (N, 3), world, that are kept (K,), with the normals of the rig.
+
+        sent: their normals (K, 3) in the frame of a pose (4, 4), if the message has some.
+        """
+        normals = None
+        if self._rig.normals != NO_NORMALS and sent is None:
+            reach = _NEAR * self._resolution
+            normals = neighbour_normals(points, kept, reach=reach, towards=pose[:3, 3])
+        elif self._rig.normals != NO_NORMALS and sent is not None:
+            normals = self._sent_normals(sent, points[kept], pose=pose)
+        self._new.append(
+            SurfacePoints.measured(points[kept], normals=normals, degrees=self._rig.normals)
+        )
 
     def _sent_normals(
         self, sent: FloatArray, points: FloatArray, *, pose: FloatArray

@@ -11,6 +11,7 @@ from chsel.numerics.arrays import frozen
 from chsel.problem.points import Workspace
 from chsel.problem.settings import Check, CheckedSettings, not_negative, one_of, positive
 
+NO_NORMALS = "none"  # setting of a sensor whose normals are not used
 _HALF_TURN = 180.0  # degrees
 
 
@@ -29,15 +30,10 @@ def _points(name: str, value: Any) -> None:
     frozen(name, value, shape=(None, 3), error=SettingError)
 
 
-def has_normals(degrees: Any) -> bool:
-    """Return whether the normals of a sensor are used, by its setting `normals`."""
-    return bool(degrees != "none")
-
-
 def _is_noise(value: Any) -> bool:
     """Return whether a value is a root mean square angle in degrees, or none."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    return bool(0.0 < value <= _HALF_TURN) if number else not has_normals(value)
+    return bool(0.0 < value <= _HALF_TURN) if number else bool(value == NO_NORMALS)
 
 
 Vector = tuple[float, float, float]
@@ -50,7 +46,7 @@ Depths = Annotated[
 Fraction = Annotated[float, _fits("above 0, at most 1", lambda part: 0.0 < part <= 1.0)]
 Part = Annotated[float, _fits("from 0 to 1", lambda part: 0.0 <= part <= 1.0)]
 Degrees = Annotated[Any, _fits("none, or degrees above 0, up to 180", _is_noise)]
-"""A root mean square angle, or "none", which a union of types could not be read as."""
+"""A root mean square angle or NO_NORMALS; settings of two types have no type that is read."""
 
 Quantile = Annotated[float, _fits("from 0 to below 1", lambda part: 0.0 <= part < 1.0)]
 
@@ -99,7 +95,7 @@ class BubbleRig(ImageRig):
     """An image file (.png, .npy) of the untouched membrane; null: the median of the first images
     before the first probe."""
 
-    normals: Degrees = "none"
+    normals: Degrees = NO_NORMALS
     """Root mean square angle by which normals of contacts, those of the membrane, are off, degrees;
     none: they are not used."""
 
@@ -156,7 +152,7 @@ class CloudRig(CheckedSettings):
     probes alone."""
 
     fraction: Annotated[float, positive] = 0.95  # of rays, as of a camera
-    normals: Degrees = "none"
+    normals: Degrees = NO_NORMALS
     """Root mean square angle by which normals are off, degrees; none: they are not used.
 
     They are the fields normal_x, normal_y and normal_z of the messages, out of the object.
@@ -166,7 +162,7 @@ class CloudRig(CheckedSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.role == "rays" and has_normals(self.normals):
+        if self.role == "rays" and self.normals != NO_NORMALS:
             raise SettingError(
                 f"normals is {self.normals!r}, and role rays has no points on the object; "
                 "accepted: none, or role surface or contacts"
@@ -199,7 +195,7 @@ class ForceRig(CheckedSettings):
     points: Annotated[int, positive] = 5
     """Most points of a probe, the strongest of those in different voxels."""
 
-    normals: Degrees = "none"
+    normals: Degrees = NO_NORMALS
     """Root mean square angle by which normals are off, degrees; none: they are not used.
 
     The normal of a contact is the direction of the force on the hand, which friction tilts.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray
-from runners.sensors.rig import Degrees, has_normals
+from runners.sensors.rig import NO_NORMALS, Degrees
 
 _ARRAYS = ("points", "contact_normals", "normals", "normal_noise")
 
@@ -32,17 +32,18 @@ class SurfacePoints:
         *,
         contact_normals: FloatArray | None = None,
         normals: FloatArray | None = None,
-        degrees: Degrees = "none",
+        degrees: Degrees = NO_NORMALS,
     ) -> SurfacePoints:
         """Return the points (N, 3) of one sensor with normals (N, 3); None: all are unknown.
 
-        degrees: setting `normals` of the sensor; with "none" no normal is kept for methods.
+        degrees: setting `normals` of the sensor; with NO_NORMALS none is kept for methods.
         """
         unknown = np.zeros_like(points)
-        if normals is None or not has_normals(degrees):
+        noise = np.zeros(len(points))
+        if normals is None or degrees == NO_NORMALS:
             normals = unknown
-        known = (normals != 0.0).any(axis=1)
-        noise = np.where(known, math.radians(degrees), 0.0) if known.any() else unknown[:, 0]
+        else:
+            noise[(normals != 0.0).any(axis=1)] = math.radians(degrees)
         shown = unknown if contact_normals is None else contact_normals
         return cls(points, shown, normals=normals, normal_noise=noise)
 
@@ -50,11 +51,12 @@ class SurfacePoints:
     def joined(cls, parts: Sequence[SurfacePoints]) -> SurfacePoints:
         """Return the points of several parts in their order; none of no part."""
         parts = [NO_POINTS, *parts]
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS))
+        arrays = {name: np.concatenate([getattr(one, name) for one in parts]) for name in _ARRAYS}
+        return cls(**arrays)
 
     def chosen(self, which: Any) -> SurfacePoints:
         """Return some of the points: by flags (N,), or by indices."""
-        return SurfacePoints(*(getattr(self, name)[which] for name in _ARRAYS))
+        return SurfacePoints(**{name: getattr(self, name)[which] for name in _ARRAYS})
 
     def __len__(self) -> int:
         return len(self.points)
