@@ -91,3 +91,17 @@ def test_normals_into_the_object_are_told(tmp_path, sign):
     assert ("normals point away from the origin of its frame; accepted: normals ou" in told) == (
         sign < 0
     )
+
+
+def test_a_normal_stays_with_its_point(tmp_path):
+    """Of 3000 points some are not finite or out of the workspace, and one a voxel is kept."""
+    ways = np.random.default_rng(5).normal(size=(3000, 3))
+    ways /= np.sqrt((ways**2).sum(axis=1, keepdims=True))
+    cloud = CENTRE + RADIUS * ways - LIDAR
+    cloud[::7] = np.nan
+    cloud[::11, 0] = 9.0
+    log = SphereLog(cloud=tuple(map(tuple, cloud.tolist())), normals=ways)
+    _, (probe, _), _ = read(log.write(tmp_path / "log.mcap"), SKIN)
+    points = probe.new_points
+    assert 300 < len(points.known) < 2000
+    np.testing.assert_allclose(points.normals, (points.known - CENTRE) / RADIUS, atol=1e-9)
