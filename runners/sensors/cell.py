@@ -14,6 +14,7 @@ from chsel.sensing.free_space import FreeGrid
 from runners.sensors.log.transforms import TransformError, TransformTree
 from runners.sensors.rig import GateRig
 from runners.sensors.session_report import LogWarnings
+from runners.sensors.surface_points import SurfacePoints
 
 _LEAST_ENTERING = 0.001  # of a sensor's rays: fewer in the workspace are there by chance
 
@@ -25,21 +26,20 @@ class FreeMap:
         self.workspace = workspace
         self.grid = FreeGrid(workspace, spacing)
 
-    def new(self, contacts: FloatArray | None = None) -> FloatArray:
+    def new(self, contacts: SurfacePoints | None = None) -> FloatArray:
         """Return centres (N, 3) of the voxels that became free since the last call.
 
-        Left out are those less than a voxel's diagonal from contacts (C, 6) with a rigid hand,
-        points and the object's outward normals, and behind them: the hand passed such a voxel, but
-        not its centre.
+        Left out are those less than a voxel's diagonal from contacts with a rigid hand, and behind
+        them by `contact_normals`: the hand passed such a voxel, but not its centre.
         """
         centres = self.grid.new()
         if contacts is None or len(contacts) == 0 or len(centres) == 0:
             return centres
         reach = sqrt(3.0) * self.grid.lattice.spacing
-        away, nearest = cKDTree(contacts[:, :3]).query(centres, distance_upper_bound=reach)
+        away, nearest = cKDTree(contacts.points).query(centres, distance_upper_bound=reach)
         near = np.flatnonzero(away <= reach)
-        beside = contacts[nearest[near]]
-        ahead = ((centres[near] - beside[:, :3]) * beside[:, 3:]).sum(axis=1)
+        beside = contacts.chosen(nearest[near])
+        ahead = ((centres[near] - beside.points) * beside.contact_normals).sum(axis=1)
         return np.delete(centres, near[ahead < 0.0], axis=0)
 
     def within(self, points: FloatArray) -> BoolArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from runners.sensors.log.transforms import JointHistory
 from runners.sensors.rig import ForceRig
 from runners.sensors.sensor import Sensed
 from runners.sensors.session_report import Counts
+from runners.sensors.surface_points import NO_POINTS, SurfacePoints
 
 _MOST_LOOKED_AT = 50  # samples of a probe, the strongest
 _MOST_TARED = 4096  # samples
@@ -33,6 +35,14 @@ class _Sample:
     time: int
     frame: str
     numbers: tuple[float, ...]  # force, N; torque, Nm
+
+
+class _Contact(NamedTuple):
+    """A contact, world. Normals are unit, out of the object."""
+
+    point: FloatArray  # (3,), metres
+    opposite: FloatArray  # (3,), normal against that of the hand
+    along_force: FloatArray  # (3,), normal along the force on the hand
 
 
 class ForceSensor:
@@ -97,15 +107,20 @@ class ForceSensor:
         self._end_row(counts)
         samples = sorted(self._strong, reverse=True)[:_MOST_LOOKED_AT]
         self._strong = []
-        found: dict[tuple[int, ...], FloatArray] = {}
+        found: dict[tuple[int, ...], _Contact] = {}
         for sample in samples:
             contact = self._contact(sample, counts)
             if contact is not None:
-                voxel = tuple(self._lattice.voxels(contact[None, :3])[0].tolist())
+                voxel = tuple(self._lattice.voxels(contact.point[None])[0].tolist())
                 found.setdefault(voxel, contact)
             if len(found) == self._rig.points:
                 break
-        contacts = np.reshape(list(found.values()), (-1, 6))
+        contacts = NO_POINTS
+        if found:
+            points, opposite, along_force = map(np.array, zip(*found.values(), strict=True))
+            contacts = SurfacePoints.measured(
+                points, contact_normals=opposite, normals=along_force, degrees=self._rig.normals
+            )
         return Sensed(contacts=contacts, rigid=True)
 
     def remark(self, total: Counts) -> str:
@@ -147,8 +162,11 @@ class ForceSensor:
         self._row.clear()
         self._in_contact = False
 
-    def _contact(self, sample: _Sample, counts: Counts) -> FloatArray | None:
-        """Return where a force acts, and the outward normal (6,), world; None, counted."""
+    def _contact(self, sample: _Sample, counts: Counts) -> _Contact | None:
+        """Return where a force acts; None, counted, where that is not known.
+
+        An object without friction pushes the hand along its own outward normal.
+        """
         sensor = self._rig.frame or sample.frame
         world_from_sensor = self._cell.world_from(sensor, sample.time, sensor=self._rig.topic)
         world_from_hand = self._cell.world_from(
@@ -178,5 +196,7 @@ class ForceSensor:
         if found.miss > self._rig.reach or not self._cell.free.within(point)[0]:
             counts.outside += 1
             return None
-        normal = -rotated(world_from_sensor[:3, :3], found.normal[None])
-        return np.concatenate([point[0], normal[0]])
+        turn = world_from_sensor[:3, :3]
+        opposite = -rotated(turn, found.normal[None])
+        along = rotated(turn, force[None] / np.sqrt((force**2).sum()))
+        return _Contact(point[0], opposite[0], along_force=along[0])

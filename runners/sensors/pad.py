@@ -37,6 +37,7 @@ from runners.sensors.log.messages import ImageMessage
 from runners.sensors.rig import BubbleRig, ContactRig
 from runners.sensors.sensor import Sensed
 from runners.sensors.session_report import Counts
+from runners.sensors.surface_points import SurfacePoints
 
 REACH = 0.1  # m: of the membrane from its camera, for how far a turn moves it
 
@@ -182,14 +183,20 @@ class Pad:
             step, self.name, kind="deformation", view=pressed, mask=imprint.touching
         )
 
-    def _contacts(self, imprint: Imprint) -> FloatArray:
-        """Return points and outward normals of the object (C, 6) at the contact pixels, world."""
+    def _contacts(self, imprint: Imprint) -> SurfacePoints:
+        """Return the contact pixels, with the normals of the membrane towards the camera."""
         view = imprint.view
         points = self._camera.back_project(view.metres)[imprint.touching]
         filled = np.where(view.valid, view.metres, self._reference)
         normals = self._normals(smooth(filled, self._contact.filter))[imprint.touching]
         pose = view.world_from_camera
-        return np.concatenate([apply(pose, points), rotated(pose[:3, :3], normals)], axis=1)
+        normals = rotated(pose[:3, :3], normals)
+        return SurfacePoints.measured(
+            apply(pose, points),
+            contact_normals=normals,
+            normals=normals,
+            degrees=self._rig.normals,
+        )
 
     def _imprint(self, time: int, message: ImageMessage, *, counts: Counts) -> Imprint | None:
         view = view_of(

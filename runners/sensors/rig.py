@@ -11,6 +11,9 @@ from chsel.numerics.arrays import frozen
 from chsel.problem.points import Workspace
 from chsel.problem.settings import Check, CheckedSettings, not_negative, one_of, positive
 
+NO_NORMALS = "none"  # setting of a sensor whose normals are not used
+_HALF_TURN = 180.0  # degrees
+
 
 def _fits(accepted: str, is_accepted: Callable[[Any], bool]) -> Check:
     """Return a check by a condition, which NaN does not fulfil, with what is accepted in words."""
@@ -27,6 +30,12 @@ def _points(name: str, value: Any) -> None:
     frozen(name, value, shape=(None, 3), error=SettingError)
 
 
+def _is_noise(value: Any) -> bool:
+    """Return whether a value is a root mean square angle in degrees, or none."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return bool(0.0 < value <= _HALF_TURN) if number else bool(value == NO_NORMALS)
+
+
 Vector = tuple[float, float, float]
 Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 Name = Annotated[str, _fits("letters, digits and _", lambda name: name.replace("_", "").isalnum())]
@@ -36,6 +45,9 @@ Depths = Annotated[
 ]
 Fraction = Annotated[float, _fits("above 0, at most 1", lambda part: 0.0 < part <= 1.0)]
 Part = Annotated[float, _fits("from 0 to 1", lambda part: 0.0 <= part <= 1.0)]
+Degrees = Annotated[Any, _fits("none, or degrees above 0, up to 180", _is_noise)]
+"""A root mean square angle or NO_NORMALS; settings of two types have no type that is read."""
+
 Quantile = Annotated[float, _fits("from 0 to below 1", lambda part: 0.0 <= part < 1.0)]
 
 
@@ -82,6 +94,10 @@ class BubbleRig(ImageRig):
     reference: str | None = None
     """An image file (.png, .npy) of the untouched membrane; null: the median of the first images
     before the first probe."""
+
+    normals: Degrees = NO_NORMALS
+    """Root mean square angle by which normals of contacts, those of the membrane, are off, degrees;
+    none: they are not used."""
 
 
 @dataclass(frozen=True)
@@ -136,6 +152,21 @@ class CloudRig(CheckedSettings):
     probes alone."""
 
     fraction: Annotated[float, positive] = 0.95  # of rays, as of a camera
+    normals: Degrees = NO_NORMALS
+    """Root mean square angle by which normals are off, degrees; none: they are not used.
+
+    They are the fields normal_x, normal_y and normal_z of the messages, out of the object.
+    Without these fields they are those of planes through the points up to twice
+    `surface_resolution` away, towards the frame's origin.
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.role == "rays" and self.normals != NO_NORMALS:
+            raise SettingError(
+                f"normals is {self.normals!r}, and role rays has no points on the object; "
+                "accepted: none, or role surface or contacts"
+            )
 
 
 @dataclass(frozen=True)
@@ -163,6 +194,12 @@ class ForceRig(CheckedSettings):
 
     points: Annotated[int, positive] = 5
     """Most points of a probe, the strongest of those in different voxels."""
+
+    normals: Degrees = NO_NORMALS
+    """Root mean square angle by which normals are off, degrees; none: they are not used.
+
+    The normal of a contact is the direction of the force on the hand, which friction tilts.
+    """
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from chsel.events import Logged, Probe, SensorImage
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.sensing.contact_sensing import contact_subset, share
@@ -16,8 +15,9 @@ from runners.sensors.hand import HAND, HandPath
 from runners.sensors.log.messages import Received
 from runners.sensors.log.probe_windows import ProbeWindow
 from runners.sensors.rig import Rig
-from runners.sensors.sensor import NO_POINTS, Sensed, Sensor, without_normals
+from runners.sensors.sensor import Sensed, Sensor
 from runners.sensors.session_report import Counts, Report
+from runners.sensors.surface_points import NO_POINTS, SurfacePoints
 
 Event = SensorImage | Logged | Probe
 
@@ -107,14 +107,16 @@ class SecondPass:
             contacts = {}
             for counts in by_sensor.values():
                 counts.contacts = 0
-        touched = np.concatenate([drawn, self._annotated(step), *contacts.values()])
+        touched = SurfacePoints.joined([drawn, self._annotated(step), *contacts.values()])
         for name, each in sensed.items():
             by_sensor[name].contacts += len(each.surface)
         rigid = [points for name, points in contacts.items() if sensed[name].rigid]
-        surface = [each.surface for each in sensed.values()]
+        known = SurfacePoints.joined([touched, *(each.surface for each in sensed.values())])
         new = KnownPoints(
-            free=self._cell.free.new(np.concatenate([NO_POINTS, *rigid])),
-            known=np.concatenate([touched, *surface])[:, :3],
+            free=self._cell.free.new(SurfacePoints.joined(rigid)),
+            known=known.points,
+            normals=known.normals,
+            normal_noise=known.normal_noise,
         )
         if self._images:
             yield from (each.image for each in sensed.values() if each.image is not None)
@@ -124,44 +126,44 @@ class SecondPass:
             "contact" if len(touched) else "free",
             new_points=new,
             gripper_path=path,
-            contacts=touched[:, :3],
-            contact_normals=touched[:, 3:],
+            contacts=touched.points,
+            contact_normals=touched.contact_normals,
         )
 
-    def _drawn(self, step: int, sensed: Mapping[str, Sensed]) -> FloatArray:
-        """Return a seeded subset (C, 6) of all candidates, counted (CHSEL, Sec. V-B)."""
+    def _drawn(self, step: int, sensed: Mapping[str, Sensed]) -> SurfacePoints:
+        """Return a seeded subset of all candidates, counted (CHSEL, Sec. V-B)."""
         key = StreamKey(self._seed, step)
         candidates = {
             name: each.candidates for name, each in sensed.items() if each.candidates is not None
         }
         shares = share([len(points) for points in candidates.values()], self._rig.contact.points)
-        drawn = [NO_POINTS]
+        drawn = []
         for index, (name, points) in enumerate(candidates.items()):
             stream = key.stream(Purpose.CONTACT_POINTS, index)
-            contacts = self._within(
-                name, points[contact_subset(len(points), shares[index], stream=stream)]
-            )
+            subset = contact_subset(len(points), shares[index], stream=stream)
+            contacts = self._within(name, points.chosen(subset))
             self._report.counts(step, name).contacts += len(contacts)
             drawn.append(contacts)
-        return np.concatenate(drawn)
+        return SurfacePoints.joined(drawn)
 
-    def _annotated(self, step: int) -> FloatArray:
-        """Return the contacts (C, 6) that the rig adds to a probe."""
+    def _annotated(self, step: int) -> SurfacePoints:
+        """Return the contacts that the rig adds to a probe, without normals."""
         extras = self._rig.annotations.contacts
         points = [point for extra in extras if extra.probe == step for point in extra.points]
-        contacts = self._within(f"probe {step}", without_normals(np.reshape(points, (-1, 3))))
+        annotated = SurfacePoints.measured(np.reshape(points, (-1, 3)))
+        contacts = self._within(f"probe {step}", annotated)
         if len(contacts):
             text = f"probe {step}: {len(contacts)} contacts added, as the rig annotates"
             self._cell.warnings.note(text)
         return contacts
 
-    def _within(self, name: str, contacts: FloatArray) -> FloatArray:
-        """Return those of contacts (C, 6) that lie in the workspace; name: whose they are."""
-        kept = self._cell.free.within(contacts[:, :3])
+    def _within(self, name: str, contacts: SurfacePoints) -> SurfacePoints:
+        """Return those of contacts that lie in the workspace; name: whose they are."""
+        kept = self._cell.free.within(contacts.points)
         self._cell.warnings.warn(
             f"{name}: a contact left out, as it is out of the workspace", int((~kept).sum())
         )
-        return contacts[kept]
+        return contacts.chosen(kept)
 
 
 def _summary(step: int, new: KnownPoints, *, by_sensor: Mapping[str, Counts]) -> str:

@@ -5,35 +5,30 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-import numpy as np
-
 from chsel.events import SensorImage
-from chsel.numerics.arrays import FloatArray
 from runners.sensors.cell import RobotCell
 from runners.sensors.first_pass import FirstPass, TopicReader
 from runners.sensors.session_report import Counts
-
-NO_POINTS = np.zeros((0, 6))
+from runners.sensors.surface_points import NO_POINTS, SurfacePoints
 
 
 @dataclass(frozen=True, eq=False)
 class Sensed:
-    """Points that a sensor gives of one probe, each with the object's outward normal.
+    """Points that a sensor gives of one probe.
 
-    Arrays (N, 6) are in the world, metres; normals are 0 where they are not known. Free space is
-    not here: a sensor marks it in `RobotCell.free`.
+    Free space is not here: a sensor marks it in `RobotCell.free`.
     """
 
-    contacts: FloatArray = field(default_factory=lambda: NO_POINTS)
+    contacts: SurfacePoints = field(default_factory=lambda: NO_POINTS)
     """Points at which the hand touches the object."""
 
-    candidates: FloatArray | None = None
+    candidates: SurfacePoints | None = None
     """Points of a contact that are too many; None: nothing was measured.
 
     A random subset of them counts, of `contact.points` of the rig for all sensors together.
     """
 
-    surface: FloatArray = field(default_factory=lambda: NO_POINTS)
+    surface: SurfacePoints = field(default_factory=lambda: NO_POINTS)
     """Points on the object that are no contacts."""
 
     rigid: bool = False
@@ -65,8 +60,3 @@ class Sensor(TopicReader, Protocol):
 
     def remark(self, total: Counts) -> str:
         """Return what is suspicious about all that the sensor gave; "" if nothing is."""
-
-
-def without_normals(points: FloatArray) -> FloatArray:
-    """Return points (N, 3) with normals 0, as they are not known (N, 6)."""
-    return np.concatenate([points, np.zeros_like(points)], axis=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
+from functools import partial
 from importlib import import_module
 from typing import Any
 
@@ -13,7 +14,7 @@ from mcap.records import Schema
 
 from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import apply
+from chsel.problem.poses import apply, rotated
 from chsel.sensing.depth_camera import PinholeCamera, matrix_numbers
 from replay.mcap.texts import one_line
 from runners.sensors.log.images import compressed_pixels, pixel_rows
@@ -207,25 +208,39 @@ def _pinhole(name: str, numbers: Any, *, width: int, height: int) -> PinholeCame
 
 
 def _ros2_cloud(message: Any, frame: str) -> CloudMessage:
-    points = packed_points(
+    fields = {part.name: (part.offset, part.datatype) for part in message.fields}
+    unpacked = partial(
+        packed_points,
         message.data,
-        {part.name: (part.offset, part.datatype) for part in message.fields},
         stride=message.point_step,
         size=(message.width, message.height),
         row=message.row_step,
         big_endian=message.is_bigendian,
     )
-    return CloudMessage(frame, points)
+    points = unpacked(fields)
+    normals = _normal_fields(fields)
+    return CloudMessage(frame, points, normals=unpacked(normals) if normals else None)
 
 
 def _foxglove_cloud(message: Any, frame: str) -> CloudMessage:
     named = {field.name: (field.offset, field.type) for field in message.fields}
     stride, data = message.point_stride, message.data
     count = len(data) // stride
-    points = packed_points(data, named, stride=stride, size=(count, 1), row=count * stride)
+    unpacked = partial(packed_points, data, stride=stride, size=(count, 1), row=count * stride)
+    points = unpacked(named)
+    of_normals = _normal_fields(named)
+    normals = unpacked(of_normals) if of_normals else None
     if message.HasField("pose"):
-        points = apply(rigid(message.pose.position, message.pose.orientation), points)
-    return CloudMessage(frame, points)
+        pose = rigid(message.pose.position, message.pose.orientation)
+        points = apply(pose, points)
+        normals = None if normals is None else rotated(pose[:3, :3], normals)
+    return CloudMessage(frame, points, normals=normals)
+
+
+def _normal_fields(fields: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
+    """Return those of a cloud's fields that are its normals, by axis; none unless all are there."""
+    named = {axis: fields.get(f"normal_{axis}", (0, 0)) for axis in _AXES}
+    return named if all(kind in _FLOATS for _, kind in named.values()) else {}
 
 
 def _transform(message: Any, frame: str) -> TransformMessage:

@@ -75,6 +75,9 @@ class CloudMessage:
     points: FloatArray
     """(N, 3), metres; those without a measurement are not finite."""
 
+    normals: FloatArray | None = None
+    """(N, 3), as they were sent, of any length; None if they were not."""
+
 
 @dataclass(frozen=True, eq=False)
 class WrenchMessage:

@@ -81,11 +81,20 @@ def _said_again(kind, said, *, packed):
         case "PointStamped":
             yield _made("Point3InFrame", said, point=_xyz(said.point))
         case "PointCloud2":
-            points = np.frombuffer(said.data).reshape(-1, 3)
-            fields = [{"name": name, "offset": 8 * k, "type": 8} for k, name in enumerate("xyz")]
-            pose = {"position": {"x": 1.0}, "orientation": {"w": 2.0}}
-            data = (points - [1.0, 0.0, 0.0]).tobytes()
-            yield _made("PointCloud", said, pose=pose, point_stride=24, fields=fields, data=data)
+            numbers = np.frombuffer(said.data).reshape(said.width, -1, 3)  # points, and normals
+            fields = [{"name": f.name, "offset": f.offset, "type": 8} for f in said.fields]
+            pose = {"position": {"x": 1.0}, "orientation": {"z": 2.0, "w": 2.0}}  # 90 degrees
+            local = numbers.copy()
+            local[:, 0] -= [1.0, 0.0, 0.0]
+            data = (local @ [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).tobytes()
+            yield _made(
+                "PointCloud",
+                said,
+                pose=pose,
+                point_stride=said.point_step,
+                fields=fields,
+                data=data,
+            )
 
 
 def _xyz(one):

@@ -45,16 +45,20 @@ def write_ros2(path, sent, *, chunk_size=2000, compression=CompressionType.ZSTD,
     return path.read_bytes()
 
 
-def ros2_cloud(points, stamp):
-    """A sensor_msgs/PointCloud2 of one row of points (N, 3), as float64."""
-    fields = [{"name": n, "offset": 8 * k, "datatype": 8, "count": 1} for k, n in enumerate("xyz")]
+def ros2_cloud(points, stamp, normals=None):
+    """A sensor_msgs/PointCloud2 of one row of points (N, 3) and normals (N, 3), as float64."""
+    names = ["x", "y", "z"]
+    if normals is not None:
+        names += ["normal_x", "normal_y", "normal_z"]
+        points = np.concatenate([points, normals], axis=1)
+    fields = [{"name": n, "offset": 8 * k, "datatype": 8, "count": 1} for k, n in enumerate(names)]
     return {
         "header": header("lidar", stamp),
         "height": 1,
         "width": len(points),
         "fields": fields,
-        "point_step": 24,
-        "row_step": 24 * len(points),
+        "point_step": 8 * len(names),
+        "row_step": 8 * len(names) * len(points),
         "data": points.astype("<f8").tobytes(),
         "is_dense": True,
     }

@@ -61,7 +61,8 @@ class SphereLog:
     camera_clock_set on. info: what its camera info has otherwise. camera_frame: its pose (4, 4).
     lost_transforms: seconds between which the hand sends none. left_out: topics without messages.
     finger: metres at which a joint of this name stands; None: no joint states. cloud: points
-    (N, 3) in the lidar's frame, sent on /lidar and /skin before and in the first probe.
+    (N, 3) in the lidar's frame, sent on /lidar and /skin before and in the first probe, with
+    normals (N, 3), if there are any.
     """
 
     marks: tuple[tuple[float, str], ...] = MARKS
@@ -74,6 +75,7 @@ class SphereLog:
     left_out: tuple[str, ...] = ()
     finger: float | None = None
     cloud: tuple[tuple[float, float, float], ...] = ()
+    normals: FloatArray | None = None
 
     def write(self, path):
         """Five seconds: standing, a push onto the sphere, and one that passes it."""
@@ -137,7 +139,7 @@ class SphereLog:
             depth = image(f"{name}_frame", values, stamp=seen_at)
             self._add(writer, f"/{name}/depth", kind="sensor_msgs/Image", message=depth, sent=stamp)
         if self.cloud and tick in (10, 40):
-            cloud = ros2_cloud(np.array(self.cloud), stamp)
+            cloud = ros2_cloud(np.array(self.cloud), stamp, normals=self.normals)
             for topic in ("/lidar", "/skin"):
                 self._add(writer, topic, kind="sensor_msgs/PointCloud2", message=cloud, sent=stamp)
 

@@ -153,6 +153,36 @@ def test_settings_of_forces(log, changes, contacts):
     assert (in_hand(probe)[:, 2] < 0.06).all() == (contacts == 0 or "acts" in changes)
 
 
+@pytest.mark.parametrize(("acts", "sign"), [("on_hand", 1.0), ("by_hand", -1.0)])
+def test_the_normal_of_a_contact_is_the_direction_of_the_force_on_the_hand(log, acts, sign):
+    forces = replace(FORCES, normals=20, acts=acts)
+    probe = read(log, forces=(forces,))[1]
+    unit = hand_pose(2.0)[:3, :3] @ FORCE / np.sqrt((FORCE**2).sum())
+    count = len(probe.contacts)
+    assert count > 0
+    np.testing.assert_allclose(probe.new_points.normals, [sign * unit] * count, atol=1e-6)
+    np.testing.assert_allclose(probe.new_points.normal_noise, np.pi / 9)
+    before = read(log, forces=(replace(FORCES, acts=acts),))[1]
+    assert not before.new_points.has_normals
+    np.testing.assert_array_equal(probe.contact_normals, before.contact_normals)
+    np.testing.assert_array_equal(probe.new_points.known, before.new_points.known)
+    np.testing.assert_array_equal(probe.new_points.free, before.new_points.free)
+
+
+def test_a_corner_of_the_hand_on_a_slope_gives_the_normal_of_the_slope(tmp_path, monkeypatch):
+    """The hand's face there is 30 degrees off the slope, which has no friction."""
+    slope = np.array([0.5, 0.0, -np.sqrt(0.75)])  # out of the object, in the hand's frame
+    monkeypatch.setattr("tests.runners.sensors.test_forces.FORCE", 7.0 * slope)
+    monkeypatch.setattr("tests.runners.sensors.test_forces.TIP", np.array([-0.02, 0.01, 0.1]))
+    path = write_log(tmp_path / "log.mcap")
+    probe = read(path, forces=(replace(FORCES, normals=20),))[1]
+    outward = hand_pose(2.0)[:3, :3] @ slope
+    assert len(probe.contacts) > 0
+    cosines = probe.new_points.normals @ outward
+    assert cosines.min() > 1.0 - 1e-9
+    assert (probe.contact_normals @ outward).max() < 0.9
+
+
 def test_a_line_of_force_that_misses_the_hand_is_left_out(log):
     thin = replace(HAND, boxes=(BoxRig((0.01, 0.01, 0.1), (0.0, 0.0, 0.05)),))
     for reach, outside in ((0.004, 11), (0.05, 0)):

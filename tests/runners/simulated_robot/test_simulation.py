@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from omegaconf import OmegaConf
 
 from chsel.events import Probe
@@ -72,6 +73,8 @@ def test_pushes_end_where_the_pads_feel_the_bottle(log):
 def test_contacts_lie_on_the_object_and_free_space_beside_it(log):
     rig = OmegaConf.to_container(OmegaConf.load(CONF / "session" / "rig" / "cabinet.yaml"))
     rig["cameras"][0]["edge_reach"] = 2  # of fewer pixels than usual
+    for pad, degrees in zip(rig["bubbles"], (10, 5), strict=True):
+        pad["normals"] = degrees
     session = SensorsSource(session_settings("sensors", {"path": str(log.path), "rig": rig}), 0)
     probes = [event for event in session.probes() if isinstance(event, Probe)]
     assert [len(probe.contacts) for probe in probes] == [50, 50]
@@ -80,7 +83,19 @@ def test_contacts_lie_on_the_object_and_free_space_beside_it(log):
         object_from_world = inverse(log.truth.world_from_object)
         return mesh_sdf(MESH, apply(object_from_world, np.concatenate(points)))[0]
 
-    felt = distance([probe.contacts for probe in probes])
+    contacts = [probe.contacts for probe in probes]
+    felt = distance(contacts)
+    normals = np.concatenate([probe.new_points.normals for probe in probes])
+    local = apply(inverse(log.truth.world_from_object), np.concatenate(contacts))
+    faces = trimesh.proximity.closest_point(MESH, local)[2]
+    outward = MESH.face_normals[faces] @ log.truth.world_from_object[:3, :3].T
+    off = np.degrees(np.arccos(np.minimum((normals * outward).sum(axis=1), 1.0)))
+    assert np.sqrt((off**2).mean()) < 4.0
+    assert off.max() < 12.0
+    for probe in probes:  # the left pad's contacts come first
+        left = session.report.by_probe[probe.step]["bubble_left"].contacts
+        noise = np.radians([10.0] * left + [5.0] * (50 - left))
+        np.testing.assert_allclose(probe.new_points.normal_noise, noise)
     assert abs(felt.mean()) < 0.0003
     assert np.quantile(np.abs(felt), 0.95) < 0.0015
     free = distance([probe.new_points.free for probe in probes])

@@ -22,7 +22,16 @@ from runners.sensors.log.messages import (
 from runners.sensors.log.raw_log import RawLog
 from runners.simulated_robot.log_writer import image, transform
 from tests.runners.sensors.foxglove_log import in_foxgloves_messages
-from tests.runners.sensors.small_logs import BEGIN, SECOND, depth, png, ros2_sent, write_ros2, xyz
+from tests.runners.sensors.small_logs import (
+    BEGIN,
+    SECOND,
+    depth,
+    png,
+    ros2_cloud,
+    ros2_sent,
+    write_ros2,
+    xyz,
+)
 
 TURNED = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])
 
@@ -91,6 +100,24 @@ def test_messages_of_both_encodings_are_decoded(tmp_path, foxglove):
         assert_same(received.content, CONTENTS[topic])
     assert found["/depth"].stamp == BEGIN + 3 * SECOND
     assert found["/probe"].stamp is None
+
+
+@pytest.mark.parametrize("foxglove", [False, True])
+def test_normals_of_a_cloud_are_decoded(tmp_path, foxglove):
+    path = tmp_path / "log.mcap"
+    points, normals = np.arange(6.0).reshape(2, 3), np.array([[0.0, 0.6, -0.8], [np.nan] * 3])
+    whole = ros2_cloud(points, BEGIN, normals=normals)
+    lacking = whole | {"fields": whole["fields"][:5]}
+    coarse = whole | {"fields": [*whole["fields"][:5], whole["fields"][5] | {"datatype": 4}]}
+    clouds = {"/whole": whole, "/lacking": lacking} | ({} if foxglove else {"/coarse": coarse})
+    kind = "sensor_msgs/PointCloud2"
+    write_ros2(path, [(topic, kind, cloud, BEGIN) for topic, cloud in clouds.items()])
+    if foxglove:
+        path = in_foxgloves_messages(path, tmp_path / "again.mcap", packed=True)
+    found = by_topic(path)
+    for topic in clouds:
+        expected = CloudMessage("lidar", points, normals=normals if topic == "/whole" else None)
+        assert_same(found[topic].content, expected)
 
 
 def test_broken_messages_are_counted_with_their_topic(tmp_path):
