@@ -48,7 +48,7 @@ POINT_CLASSES = ("free", "occupied", "known")
 _OF_KNOWN = ("known", "known_sdf", "normals", "normal_noise")
 _ARRAYS = ("free", "occupied", *_OF_KNOWN)
 _UNIT = 1e-6  # by which the squared length of a normal may be off
-_NEAR_UNIT = 0.01  # the same of the length of one that a program or a file gives
+NEAR_UNIT = 0.01  # the same of the length of one that a program or a file gives
 NORMAL_NOISE = 0.25  # radians, of normals about which nothing else is known
 _BLOCK = np.array(list(np.ndindex(3, 3, 3))) - 1  # a voxel, at index 13, and its 26 neighbours
 _MOST_VOXELS = 2.0**62  # that can be numbered
@@ -223,7 +223,7 @@ def unit_normals(name: str, given: Any, *, noise: Any, count: int) -> tuple[Floa
     known = (normals != 0.0).any(axis=1)
     squares = (normals**2).sum(axis=1)
     lengths = np.where(np.abs(squares - 1.0) <= _UNIT, 1.0, np.sqrt(squares))
-    wrong = known & (np.abs(lengths - 1.0) > _NEAR_UNIT)
+    wrong = known & (np.abs(lengths - 1.0) > NEAR_UNIT)
     if wrong.any():
         at = int(np.argmax(wrong))
         raise PointsError(

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar
 
+from chsel.problem.points import NORMAL_NOISE
 from chsel.problem.settings import (
     CheckedSettings,
     Presets,
@@ -21,7 +22,10 @@ from runners.sessions.probing_hand import DescribedHand
 Length = Annotated[float, positive]  # m
 Force = Annotated[float, positive]  # N
 Count = Annotated[int, not_negative]
-_STANDING = (("moves", 0.0), ("expect_moves", None))  # an object that stands still
+_NOT_RECORDED = (
+    *(("moves", 0.0), ("expect_moves", None)),  # an object that stands still
+    *(("normals", "none"), ("normal_noise", NORMAL_NOISE)),  # of points in files
+)
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ def expected_moves(session: Mapping[str, Any]) -> float:
 def without_defaults(session: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings as they are recorded: some only where they are not the default."""
     defaults = {"faults": LEVELS[CLEAN], "hand": DescribedHand()}
-    session = {k: v for k, v in session.items() if (k, v) not in _STANDING}
+    session = {k: v for k, v in session.items() if (k, v) not in _NOT_RECORDED}
     return {
         key: value
         for key, value in session.items()
