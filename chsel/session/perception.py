@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -268,6 +269,7 @@ def perceived(
     camera: Any = None,
     world_from_camera: Any = None,
     mask: Any = None,
+    image_normal_noise: Any = None,
     surface: Any = None,
     diameter: float,
     spacing: float,
@@ -295,6 +297,8 @@ def perceived(
             "depth, camera and world_from_camera belong together, with or without mask; "
             "accepted: all of them or none"
         )
+    if image_normal_noise is not None and mask is None:
+        raise PointsError("image_normal_noise has no mask; accepted: with depth and mask, or none")
     free_points = known_points(free=free).free
     others = known_points(occupied=occupied, known=known, known_sdf=known_sdf)
     nodes = np.zeros((0, 3))
@@ -319,9 +323,15 @@ def perceived(
             camera = PinholeCamera.of_matrix(camera, width, height=height)
         mask = None if mask is None else _mask(mask)
         look = depth_look(
-            depth, camera, world_from_camera=world_from_camera, mask=mask, before=spacing, side=side
+            depth,
+            camera,
+            world_from_camera=world_from_camera,
+            mask=mask,
+            before=spacing,
+            side=side,
+            with_normals=image_normal_noise is not None,
         )
-        seen = KnownPoints(known=look.surface)
+        seen = _seen_points(look, image_normal_noise)
     return Perception(
         touched=touched,
         free=free_points,
@@ -332,6 +342,22 @@ def perceived(
         look=look,
         seen=seen,
         spacing=side,
+    )
+
+
+def _seen_points(look: DepthLook, normal_noise: Any) -> KnownPoints:
+    """Return the points of a look; normal_noise: of its normals, radians, None for no normals."""
+    if normal_noise is None:
+        return KnownPoints(known=look.surface)
+    (noise,) = frozen("image_normal_noise", [normal_noise], shape=(1,))
+    if not 0.0 < noise <= math.pi:
+        text = "in degrees? " if noise > math.pi else ""
+        raise PointsError(
+            f"image_normal_noise is {noise:.4g}; {text}accepted: above 0, up to pi, radians"
+        )
+    known = look.normals.any(axis=1)
+    return KnownPoints(
+        known=look.surface, normals=look.normals, normal_noise=np.where(known, noise, 0.0)
     )
 
 

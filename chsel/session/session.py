@@ -308,6 +308,7 @@ class Session:
         camera: PinholeCamera | Any = None,
         world_from_camera: Any = None,
         mask: Any = None,
+        image_normal_noise: Any = None,
         surface: Any = None,
     ) -> None:
         """Add what became known; it is in the recording when this returns.
@@ -322,6 +323,8 @@ class Session:
         depth (H, W): metres along z, 0, NaN or masked where there is none, of a camera that is a
         PinholeCamera or a matrix (3, 3), at world_from_camera (4, 4): rays are free up to a voxel
         before what they see. mask (H, W): the object's pixels, which give points on it.
+        image_normal_noise: root mean square angle by which normals of the image are off, radians;
+        its points then have normals where their pixel is on no edge.
         Raises ChselError for malformed input and for what cannot be recorded, with nothing added;
         RecordingError once, with everything added, where the recording cannot be written any more.
         """
@@ -341,6 +344,7 @@ class Session:
             camera=camera,
             world_from_camera=world_from_camera,
             mask=mask,
+            image_normal_noise=image_normal_noise,
             surface=surface,
         )
         self.commit(prepared)
