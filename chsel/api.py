@@ -48,6 +48,8 @@ def register(
     target: trimesh.Trimesh | SdfGrid,
     *unnamed: Any,
     contacts: Any = None,
+    normals: Any = None,
+    normal_noise: Any = None,
     surface: Any = None,
     free: Any = None,
     occupied: Any = None,
@@ -73,6 +75,9 @@ def register(
     occupied (K, 3): points on, outside and inside of the object. known (L, 3), known_sdf (L,):
     points of known signed distance, metres. Numpy arrays, torch tensors or lists. A place on the
     object that is measured again counts once. surface: refused, the former name of contacts.
+    normals (M, 3): unit vectors of the contacts out of the object, world; (0, 0, 0) where one is
+    not known. normal_noise: root mean square angle by which they are off, radians, one number or
+    (M,); by default 0.25.
     method, preset: see chsel.methods; by default `anchored`, and in the presets paper and reference
     `chsel`, their method. settings: a mapping of single settings over the preset's, such as
     {"size": "large"}, or a whole settings object.
@@ -95,7 +100,13 @@ def register(
         raise PointsError("points have no name; accepted: chsel.register(mesh, contacts=points)")
     refuse_surface(surface)
     given = known_points(
-        contacts=contacts, free=free, occupied=occupied, known=known, known_sdf=known_sdf
+        contacts=contacts,
+        normals=normals,
+        normal_noise=normal_noise,
+        free=free,
+        occupied=occupied,
+        known=known,
+        known_sdf=known_sdf,
     )
     if given.count == 0:
         raise PointsError("no point was given; accepted: contacts, free, occupied or known points")

@@ -48,7 +48,7 @@ POINT_CLASSES = ("free", "occupied", "known")
 _OF_KNOWN = ("known", "known_sdf", "normals", "normal_noise")
 _ARRAYS = ("free", "occupied", *_OF_KNOWN)
 _UNIT = 1e-6  # by which the squared length of a normal may be off
-_NEAR_UNIT = 0.01  # the same of the length of one that a program or a file gives
+NEAR_UNIT = 0.01  # the same of the length of one that a program or a file gives
 NORMAL_NOISE = 0.25  # radians, of normals about which nothing else is known
 _BLOCK = np.array(list(np.ndindex(3, 3, 3))) - 1  # a voxel, at index 13, and its 26 neighbours
 _MOST_VOXELS = 2.0**62  # that can be numbered
@@ -96,8 +96,9 @@ class KnownPoints(ShapesShown):
         count = len(self.known)
         normals = np.zeros((count, 3)) if self.normals is None else self.normals
         noise = np.zeros(count) if self.normal_noise is None else self.normal_noise
-        normals = frozen("normals", normals, shape=(count, 3))
-        noise = frozen("normal_noise", noise, shape=(count,))
+        # Plus 0: -0 is 0, and has another digest.
+        normals = read_only(frozen("normals", normals, shape=(count, 3)) + 0.0)
+        noise = read_only(frozen("normal_noise", noise, shape=(count,)) + 0.0)
         given = (normals != 0.0).any(axis=1)
         wrong = given & (np.abs((normals**2).sum(axis=1) - 1.0) > _UNIT)
         if wrong.any():
@@ -208,8 +209,9 @@ def unit_normals(name: str, given: Any, *, noise: Any, count: int) -> tuple[Floa
     """Return normals (N, 3) and their noise (N,) as a program or a file gives them, radians.
 
     name: of the normals, in errors. given: None for no normals; (0, 0, 0) for one that is not
-    known. noise: one number for all, or one each; None for NORMAL_NOISE.
-    Raises PointsError for another count, for NaN, and for lengths that are not 1.
+    known. noise: one number for all, or one each; None for NORMAL_NOISE. Normals that KnownPoints
+    accepts keep their bits. Raises PointsError for another count, for NaN, and for lengths that are
+    not 1.
     """
     if given is None:
         if noise is not None:
@@ -218,28 +220,30 @@ def unit_normals(name: str, given: Any, *, noise: Any, count: int) -> tuple[Floa
     normals = frozen(name, given, shape=(None, 3))
     if len(normals) != count:
         raise PointsError(f"{name} has {len(normals)} rows; accepted: one per point, {count}")
-    lengths = np.sqrt((normals**2).sum(axis=1, keepdims=True))
-    wrong = (lengths[:, 0] > 0.0) & (np.abs(lengths[:, 0] - 1.0) > _NEAR_UNIT)
+    known = (normals != 0.0).any(axis=1)
+    squares = (normals**2).sum(axis=1)
+    lengths = np.where(np.abs(squares - 1.0) <= _UNIT, 1.0, np.sqrt(squares))
+    wrong = known & (np.abs(lengths - 1.0) > NEAR_UNIT)
     if wrong.any():
         at = int(np.argmax(wrong))
         raise PointsError(
-            f"{name}[{at}] is {lengths[at, 0]:.4g} long; accepted: unit vectors out of the "
+            f"{name}[{at}] is {lengths[at]:.4g} long; accepted: unit vectors out of the "
             "object, or 0 where a normal is not known"
         )
-    one = np.ndim(noise) == 0
+    one = not isinstance(noise, list | tuple) and np.ndim(noise) == 0
     noise = frozen(
         "normal_noise", [NORMAL_NOISE if noise is None else noise] if one else noise, shape=(None,)
     )
     if not one and len(noise) != count:
         raise PointsError(f"normal_noise has {len(noise)} entries; accepted: one, or {count}")
-    if not ((noise > 0.0) & (noise <= math.pi)).all():
+    needed = True if one else known
+    if ((noise < 0.0) | (noise > math.pi) | (needed & (noise == 0.0))).any():
         text = "in degrees? " if (noise > math.pi).any() else ""
         raise PointsError(
-            f"normal_noise is {noise.max() if text else noise.min():.4g}: {text}accepted: above 0, "
+            f"normal_noise is {noise.max() if text else noise.min():.4g}; {text}accepted: above 0, "
             "up to pi, radians"
         )
-    unit = normals / np.where(lengths > 0.0, lengths, 1.0)
-    return unit, np.where(lengths[:, 0] > 0.0, noise, 0.0)
+    return normals / np.where(known, lengths, 1.0)[:, None], np.where(known, noise, 0.0)
 
 
 def world_known_points(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import hypot, isqrt, sqrt
+from math import cos, hypot, isqrt, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from chsel.errors import (
 )
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, frozen
 from chsel.problem.points import FARTHEST_PLACE, Lattice
-from chsel.problem.poses import apply, nearest_rigid
+from chsel.problem.poses import apply, nearest_rigid, rotated
 
 MOST_PIXELS = 100_000  # on a side
 MOST_FOCUS = 1e6  # pixels: focal lengths, and coordinates of the principal point
@@ -31,6 +31,11 @@ _REGION_JUMP = 0.01  # share of the depth: the same within a mask
 _PART = 0.05  # of the largest region of a mask: smaller ones are left out
 _OUTLINE = 2  # pixels by which a mask may be off
 _FARTHEST = 20.0  # m: of what a camera sees nearest
+_STEP = 0.003  # share of the depth: of a surface, between neighbouring pixels, by its noise
+_WINDOW = 0.25  # of the distance between points: from which pixels a normal is
+_MOST_REACH = 6  # pixels: of this window
+_BENT = 0.35  # radians between the planes of two halves of a window: there is an edge between
+_LEAST_AREA = 1e-3  # determinant of the second moments of pixels that are in no line
 _MATRIX_ROUNDING = 1e-6  # of the focal length
 _OFF_CENTRE = 0.05  # of the longer side: principal points are nearer to the centre
 
@@ -294,6 +299,7 @@ class DepthLook(NamedTuple):
     ends: FloatArray  # (H, W), metres: depths up to which rays are free
     rays: BoolArray  # (H, W): pixels whose rays count
     surface: FloatArray  # (M, 3): points on the object, world
+    normals: FloatArray  # (M, 3): unit, world; 0 where one is not known, or none was asked for
 
 
 def depth_look(
@@ -304,12 +310,14 @@ def depth_look(
     mask: Any = None,
     before: float,
     side: float,
+    with_normals: bool = False,
 ) -> DepthLook:
     """Return the free rays of a depth image, and points of what a mask (H, W) says is the object.
 
     before: metres that rays end before what they see. side: of voxels of which each gives one point
-    at most, metres. Pixels beside jumps of depth, at the mask's outline and in its small regions
-    are left out. Raise PointsError for an image without a depth, or a mask without a pixel left.
+    at most, metres. with_normals: see `pixel_normals`. Pixels beside jumps of depth, at the mask's
+    outline and in its small regions are left out. Raise PointsError for an image without a depth,
+    or a mask without a pixel left.
     """
     from scipy.ndimage import binary_erosion  # which takes long to import
 
@@ -324,7 +332,7 @@ def depth_look(
         raise PointsError(f"the nearest depth is {nearest:g} m: millimetres? accepted: metres")
     depth = np.where(valid, depth, 0.0)
     rays = valid & ~occlusion_edges(depth, valid, jump=_JUMP)
-    surface = np.zeros((0, 3))
+    surface = normals = np.zeros((0, 3))
     if mask is not None:
         mask = camera.image("mask", mask, dtype=bool)
         within = binary_erosion(mask, np.ones((3, 3)), iterations=_OUTLINE, border_value=1)
@@ -341,7 +349,16 @@ def depth_look(
                 f"what mask shows is {away:g} m away: millimetres, or a mask beside the object? "
                 "accepted: metres"
             )
-        surface = one_per_voxel(apply(pose, camera.back_project(depth)[on_object]), side)
+        surface = apply(pose, camera.back_project(depth)[on_object])
+        chosen = first_in_voxels(surface, side)
+        surface = surface[chosen]
+        normals = np.zeros_like(surface)
+        if with_normals:
+            pixels = np.argwhere(on_object)[chosen]
+            reach = _WINDOW * side * min(camera.fx, camera.fy) / away
+            reach = int(np.clip(np.rint(reach), 1, _MOST_REACH))
+            found = pixel_normals(depth, on_object, pixels=pixels, camera=camera, reach=reach)
+            normals = rotated(pose[:3, :3], found)
         rays &= on_object | ~mask
     return DepthLook(
         camera,
@@ -350,17 +367,110 @@ def depth_look(
         ends=np.maximum(depth - before, 0.0),
         rays=rays,
         surface=surface,
+        normals=normals,
     )
+
+
+def pixel_normals(
+    depth: FloatArray, counts: BoolArray, *, pixels: IntArray, camera: PinholeCamera, reach: int
+) -> FloatArray:
+    """Return normals (M, 3) of what pixels (M, 2), rows and columns, see, towards the camera.
+
+    Unit vectors in the camera frame, of the planes nearest to the inverse depths around each pixel,
+    as these are linear in rows and columns on a plane. depth (H, W): metres. counts (H, W): pixels
+    that can be used, with a depth above 0. reach: pixels used on each side, those that no jump of
+    depth separates from the middle. A normal is 0 where these are fewer than half of all, and where
+    the planes of two opposite halves differ, as at an edge.
+    """
+    steps = np.arange(-reach, reach + 1)
+    down, right = (each.reshape(-1, 1) for each in np.meshgrid(steps, steps, indexing="ij"))
+    rows = pixels[:, 0] + down
+    columns = pixels[:, 1] + right
+    inside = (rows >= 0) & (rows < camera.height) & (columns >= 0) & (columns < camera.width)
+    rows = np.clip(rows, 0, camera.height - 1)
+    columns = np.clip(columns, 0, camera.width - 1)
+    there = depth[rows, columns]
+    used = _joined(there, inside & counts[rows, columns], camera=camera, reach=reach)
+    inverse_depth = 1.0 / np.where(used, there, 1.0)
+    whole, *halves = (
+        _plane_normals(
+            used & part,
+            down=down,
+            right=right,
+            inverse_depth=inverse_depth,
+            pixels=pixels,
+            camera=camera,
+        )
+        for part in (True, down <= 0, down >= 0, right <= 0, right >= 0)
+    )
+    straight = 2 * used.sum(axis=0) > len(used)
+    for one, other in (halves[:2], halves[2:]):
+        known = one.any(axis=1) & other.any(axis=1)
+        straight &= ~known | ((one * other).sum(axis=1) >= cos(_BENT))
+    return np.where(straight[:, None], whole, 0.0)
+
+
+def _joined(
+    there: FloatArray, counts: BoolArray, *, camera: PinholeCamera, reach: int
+) -> BoolArray:
+    """Return which pixels of windows (K, M) are joined to the middle by pixels of one surface."""
+    side = 2 * reach + 1
+    used = np.zeros_like(counts)
+    middle = np.array([reach, reach])
+    for at in sorted(np.ndindex(side, side), key=lambda at: np.abs(at - middle).max()):
+        step = np.sign(at - middle)  # away from the middle
+        before = np.ravel_multi_index(at - step, (side, side))
+        n = np.ravel_multi_index(at, (side, side))
+        if n == before:
+            used[n] = counts[n]
+            continue
+        share = _STEP + _STEEPEST * max(abs(step[1]) / camera.fx, abs(step[0]) / camera.fy)
+        used[n] = counts[n] & used[before] & _linked(there[n], there[before], share=share)
+    return used
+
+
+def _plane_normals(
+    used: BoolArray,
+    *,
+    down: IntArray,
+    right: IntArray,
+    inverse_depth: FloatArray,
+    pixels: IntArray,
+    camera: PinholeCamera,
+) -> FloatArray:
+    """Return normals (M, 3) of planes through used pixels of windows (K, M), 0 for a line."""
+    weights = used / np.maximum(used.sum(axis=0), 1)
+    x, y, q = ((weights * each).sum(axis=0) for each in (right, down, inverse_depth))
+    across, along, values = right - x, down - y, inverse_depth - q
+    xx, yy, xy = (
+        (weights * each).sum(axis=0) for each in (across * across, along * along, across * along)
+    )
+    xq, yq = ((weights * each).sum(axis=0) for each in (across * values, along * values))
+    area = xx * yy - xy * xy
+    scale = 1.0 / np.where(area > _LEAST_AREA, area, np.inf)
+    per_column = (yy * xq - xy * yq) * scale
+    per_row = (xx * yq - xy * xq) * scale
+    row, column = pixels.T
+    at_centre = q - per_column * (x + column - camera.cx) - per_row * (y + row - camera.cy)
+    normals = -np.stack([camera.fx * per_column, camera.fy * per_row, at_centre], axis=1)
+    lengths = np.sqrt((normals**2).sum(axis=1))
+    scale = np.where(area > _LEAST_AREA, 1.0 / np.maximum(lengths, 1e-300), 0.0)
+    return normals * scale[:, None]
 
 
 def one_per_voxel(points: FloatArray, side: float) -> FloatArray:
     """Return those of points (N, 3) nearest to the centre of their voxel (M, 3), in their order."""
+    return points[first_in_voxels(points, side)]
+
+
+def first_in_voxels(points: FloatArray, side: float) -> IntArray:
+    """Return indices (M,) of points (N, 3) nearest to the centre of their voxel, ascending."""
     lattice = Lattice((0.0, 0.0, 0.0), side)
     voxels = lattice.voxels(points)
     distance = ((points - lattice.centres(voxels)) ** 2).sum(axis=1)
     nearest_first = np.argsort(distance, kind="stable")
     _, first = np.unique(voxels[nearest_first], axis=0, return_index=True)
-    return points[np.sort(nearest_first[first])]
+    return np.sort(nearest_first[first])
 
 
 def outside_of(on_object: FloatArray, free: FloatArray, *, spacing: float) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,6 +20,7 @@ from chsel.problem.points import (
     check_points,
     distinct_points,
     same_place,
+    unit_normals,
     workspace_around,
     world_known_points,
     world_points,
@@ -41,19 +43,20 @@ _FINEST_DEPTHS = 6.5535  # m: up to which 16 bits hold tenths of a millimetre
 class Perception(NamedTuple):
     """Points, a moving hand and a depth image that became known at once; world, metres."""
 
-    contacts: FloatArray  # (C, 3)
+    touched: KnownPoints  # contacts, with their normals
     free: FloatArray  # (N, 3)
     others: KnownPoints  # occupied points, and known ones that are not contacts
     path: FloatArray  # (P, 4, 4): world_from_hand
     hand: FloatArray  # (M, 3): points inside the hand, in its frame
     swept: FloatArray  # (Q, 4, 4): poses world_from_hand on the path, close together
     look: DepthLook | None
-    spacing: float  # of points that the look gives, metres
+    seen: KnownPoints  # points on the object that the look gives, with their normals
+    spacing: float  # of these points, metres
 
     @property
     def touching(self) -> KnownPoints:
         """All points but the free ones and those of the look."""
-        return KnownPoints(known=self.contacts).merged(self.others)
+        return self.touched.merged(self.others)
 
     def check(self, diameter: float, workspace: Workspace | None) -> list[InputWarning]:
         """Return warnings about places in another unit, and a camera with a swapped centre."""
@@ -114,10 +117,9 @@ class Intake:
         touching, found = distinct_points(
             perception.touching, self._since, apart=same_place(self.diameter)
         )
-        seen = np.zeros((0, 3))
-        if look is not None:
-            seen = look.surface[away_from(look.surface, self._seen, apart=perception.spacing)]
-        on_object = touching.merged(KnownPoints(known=seen))
+        places = perception.seen.known
+        seen = perception.seen.with_known(away_from(places, self._seen, apart=perception.spacing))
+        on_object = touching.merged(seen)
         grid = self._grid
         given_workspace = None
         if grid is not None:
@@ -132,7 +134,7 @@ class Intake:
             grid = FreeGrid(workspace, spacing)
             started = replace(started, workspace=workspace)
         outcome = "free"
-        if len(perception.contacts):
+        if len(perception.touched.known):
             outcome = "contact"
         elif perception.others.count:
             outcome = "points"
@@ -141,8 +143,8 @@ class Intake:
             outcome="points" if look is not None else outcome,
             new_points=on_object,
             gripper_path=perception.path[evenly_spaced(len(perception.path), _MOST_SHOWN)],
-            contacts=perception.contacts,
-            contact_normals=np.zeros_like(perception.contacts),
+            contacts=perception.touched.known,
+            contact_normals=perception.touched.normals,
         )
         image = None
         if look is not None:
@@ -156,7 +158,7 @@ class Intake:
             probe=probe,
             image=image,
             touching=touching,
-            seen=seen,
+            seen=seen.known,
             warnings=[*found, *perception.check(started.sdf.diameter, given_workspace)],
         )
 
@@ -190,6 +192,8 @@ class Intake:
 def known_points(
     *,
     contacts: Any = None,
+    normals: Any = None,
+    normal_noise: Any = None,
     free: Any = None,
     occupied: Any = None,
     known: Any = None,
@@ -199,9 +203,47 @@ def known_points(
 
     Arguments as of `chsel.register`. Raise PointsError for malformed ones.
     """
-    touched = KnownPoints(known=world_points("contacts", contacts))
+    touched = touched_points(contacts=contacts, normals=normals, normal_noise=normal_noise)
     others = world_known_points(free=free, occupied=occupied, known=known, known_sdf=known_sdf)
     return touched.merged(others)
+
+
+def touched_points(
+    *,
+    contacts: Any = None,
+    normals: Any = None,
+    normal_noise: Any = None,
+    contact: Any = None,
+    normal: Any = None,
+) -> KnownPoints:
+    """Return contacts with their normals, and after them the single one.
+
+    Arguments as of `Session.add`. Raise PointsError for malformed ones.
+    """
+    if normals is not None and contacts is None:
+        raise PointsError("normals have no contacts; accepted: both, or contacts alone")
+    if normal is not None and contact is None:
+        raise PointsError("normal has no contact; accepted: both, or contact alone")
+    if normal_noise is not None and normals is None and normal is None:
+        raise PointsError("normal_noise has no normals; accepted: both, or none")
+    if normal is not None and normal_noise is not None and np.ndim(normal_noise) > 0:
+        raise PointsError("normal_noise is an array beside normal; accepted: one number for all")
+    places = world_points("contacts", contacts)
+    noise = None if normals is None else normal_noise
+    touched = _with_normals(places, name="normals", normals=normals, noise=noise)
+    if contact is None:
+        return touched
+    place = frozen("contact", contact, shape=(3,), most=FARTHEST_PLACE)[None]
+    if normal is not None:
+        normal = frozen("normal", normal, shape=(3,))[None]
+    noise = None if normal is None else normal_noise
+    return touched.merged(_with_normals(place, name="normal", normals=normal, noise=noise))
+
+
+def _with_normals(places: FloatArray, *, name: str, normals: Any, noise: Any) -> KnownPoints:
+    """Return contacts (M, 3) with the normals of an argument; None: without."""
+    normals, normal_noise = unit_normals(name, normals, noise=noise, count=len(places))
+    return KnownPoints(known=places, normals=normals, normal_noise=normal_noise)
 
 
 def refuse_surface(surface: Any) -> None:
@@ -213,6 +255,8 @@ def refuse_surface(surface: Any) -> None:
 def perceived(
     *,
     contacts: Any = None,
+    normals: Any = None,
+    normal_noise: Any = None,
     free: Any = None,
     occupied: Any = None,
     known: Any = None,
@@ -220,10 +264,12 @@ def perceived(
     hand: Any = None,
     path: Any = None,
     contact: Any = None,
+    normal: Any = None,
     depth: Any = None,
     camera: Any = None,
     world_from_camera: Any = None,
     mask: Any = None,
+    image_normal_noise: Any = None,
     surface: Any = None,
     diameter: float,
     spacing: float,
@@ -234,6 +280,13 @@ def perceived(
     Raise ChselError for malformed input, see there.
     """
     refuse_surface(surface)
+    touched = touched_points(
+        contacts=contacts,
+        normals=normals,
+        normal_noise=normal_noise,
+        contact=contact,
+        normal=normal,
+    )
     if all(each is None for each in (contacts, free, occupied, known, path, contact, depth)):
         raise PointsError("nothing was added; accepted: points, a path or a depth image")
     if (hand is None) is not (path is None):
@@ -244,10 +297,8 @@ def perceived(
             "depth, camera and world_from_camera belong together, with or without mask; "
             "accepted: all of them or none"
         )
-    touched = known_points(contacts=contacts).known
-    if contact is not None:
-        contact = frozen("contact", contact, shape=(3,), most=FARTHEST_PLACE)
-        touched = np.concatenate([touched, contact[None]])
+    if image_normal_noise is not None and mask is None:
+        raise PointsError("image_normal_noise has no mask; accepted: with depth and mask, or none")
     free_points = known_points(free=free).free
     others = known_points(occupied=occupied, known=known, known_sdf=known_sdf)
     nodes = np.zeros((0, 3))
@@ -263,6 +314,7 @@ def perceived(
         radius = float(np.sqrt((corners**2).sum(axis=1)).max())
         swept = poses_between(poses, step=0.5 * spacing, radius=radius)
     look = None
+    seen = KnownPoints()
     side = diameter / _ACROSS
     if depth is not None:
         depth = _depths(depth)
@@ -271,17 +323,41 @@ def perceived(
             camera = PinholeCamera.of_matrix(camera, width, height=height)
         mask = None if mask is None else _mask(mask)
         look = depth_look(
-            depth, camera, world_from_camera=world_from_camera, mask=mask, before=spacing, side=side
+            depth,
+            camera,
+            world_from_camera=world_from_camera,
+            mask=mask,
+            before=spacing,
+            side=side,
+            with_normals=image_normal_noise is not None,
         )
+        seen = _seen_points(look, image_normal_noise)
     return Perception(
-        contacts=touched,
+        touched=touched,
         free=free_points,
         others=others,
         path=poses,
         hand=nodes,
         swept=swept,
         look=look,
+        seen=seen,
         spacing=side,
+    )
+
+
+def _seen_points(look: DepthLook, normal_noise: Any) -> KnownPoints:
+    """Return the points of a look; normal_noise: of its normals, radians, None for no normals."""
+    if normal_noise is None:
+        return KnownPoints(known=look.surface)
+    (noise,) = frozen("image_normal_noise", [normal_noise], shape=(1,))
+    if not 0.0 < noise <= math.pi:
+        text = "in degrees? " if noise > math.pi else ""
+        raise PointsError(
+            f"image_normal_noise is {noise:.4g}; {text}accepted: above 0, up to pi, radians"
+        )
+    known = look.normals.any(axis=1)
+    return KnownPoints(
+        known=look.surface, normals=look.normals, normal_noise=np.where(known, noise, 0.0)
     )
 
 

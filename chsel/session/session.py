@@ -294,6 +294,8 @@ class Session:
         self,
         *,
         contacts: Any = None,
+        normals: Any = None,
+        normal_noise: Any = None,
         free: Any = None,
         occupied: Any = None,
         known: Any = None,
@@ -301,27 +303,35 @@ class Session:
         hand: trimesh.Trimesh | None = None,
         path: Any = None,
         contact: Any = None,
+        normal: Any = None,
         depth: Any = None,
         camera: PinholeCamera | Any = None,
         world_from_camera: Any = None,
         mask: Any = None,
+        image_normal_noise: Any = None,
         surface: Any = None,
     ) -> None:
         """Add what became known; it is in the recording when this returns.
 
         contacts (M, 3), free (N, 3), occupied (K, 3), known (L, 3) with known_sdf (L,): as in
         `chsel.register`, world frame, metres. Free points are merged into voxels, and a place on
-        the object that is measured again counts once.
+        the object that is measured again counts once, with the normal of the first time.
+        normals (M, 3), normal_noise: of the contacts, as in `chsel.register`.
         hand, path: a closed mesh in its own frame, and the poses world_from_hand (P, 4, 4) that it
-        went through: its inside is free space. contact (3,): where it was stopped.
+        went through: its inside is free space. contact (3,): where it was stopped. normal (3,): of
+        the object there, with normal_noise, which is one number then.
         depth (H, W): metres along z, 0, NaN or masked where there is none, of a camera that is a
         PinholeCamera or a matrix (3, 3), at world_from_camera (4, 4): rays are free up to a voxel
         before what they see. mask (H, W): the object's pixels, which give points on it.
+        image_normal_noise: root mean square angle by which normals of the image are off, radians;
+        its points then have normals where their pixel is on no edge.
         Raises ChselError for malformed input and for what cannot be recorded, with nothing added;
         RecordingError once, with everything added, where the recording cannot be written any more.
         """
         prepared = self.prepare(
             contacts=contacts,
+            normals=normals,
+            normal_noise=normal_noise,
             free=free,
             occupied=occupied,
             known=known,
@@ -329,10 +339,12 @@ class Session:
             hand=hand,
             path=path,
             contact=contact,
+            normal=normal,
             depth=depth,
             camera=camera,
             world_from_camera=world_from_camera,
             mask=mask,
+            image_normal_noise=image_normal_noise,
             surface=surface,
         )
         self.commit(prepared)

@@ -89,8 +89,10 @@ def exported_points(recording: Recording, steps: str | None) -> Exported:
 
     npz: `free` (N, 3), `occupied` (K, 3), `known` (M, 3), metres, with `known_sdf` (M,), the steps
     `free_step`, `occupied_step`, `known_step`, and `world_from_object` (4, 4) where it is known.
-    Table: a row a point. Contacts are known points of signed distance 0. What was known before the
-    first probe stands first, at the step of that probe.
+    Where normals are known, `known_normal` (M, 3), 0 where one is not, and `known_normal_noise`
+    (M,), radians. Table: a row a point; nx, ny, nz and normal_noise where normals are known.
+    Contacts are known points of signed distance 0. What was known before the first probe stands
+    first, at the step of that probe.
     """
     probes = recording.probes
     news = [(probe.step, probe.new_points) for probe in probes]
@@ -101,6 +103,10 @@ def exported_points(recording: Recording, steps: str | None) -> Exported:
     chosen = _chosen(recording, steps, existing=existing, name="point")
     news = [(step, new) for step, new in news if step in chosen]
     arrays: dict[str, Any] = {"known_sdf": np.concatenate([new.sdf for _, new in news])}
+    with_normals = any(new.has_normals for _, new in news)
+    if with_normals:
+        arrays["known_normal"] = np.concatenate([new.normals for _, new in news])
+        arrays["known_normal_noise"] = np.concatenate([new.normal_noise for _, new in news])
     tables = []
     for kind in POINT_CLASSES:
         groups = [getattr(new, kind) for _, new in news]
@@ -108,10 +114,24 @@ def exported_points(recording: Recording, steps: str | None) -> Exported:
         arrays[f"{kind}_step"] = np.repeat([step for step, _ in news], list(map(len, groups)))
         columns = dict(zip("xyz", arrays[kind].T, strict=True)) | {"kind": kind}
         columns["sdf"] = arrays["known_sdf"] if kind == "known" else np.nan
-        tables.append(pd.DataFrame(columns | {"step": arrays[f"{kind}_step"]}))
+        columns["step"] = arrays[f"{kind}_step"]
+        if with_normals:
+            columns |= _normal_columns(arrays if kind == "known" else {})
+        tables.append(pd.DataFrame(columns))
     if recording.start.world_from_object is not None:
         arrays["world_from_object"] = recording.start.world_from_object
     return Exported(arrays.items(), pd.concat(tables))
+
+
+def _normal_columns(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the columns of known normals; NaN in rows without one."""
+    names = ("nx", "ny", "nz", "normal_noise")
+    if not arrays:
+        return dict.fromkeys(names, np.nan)
+    noise = arrays["known_normal_noise"]
+    known = np.where(noise > 0.0, 1.0, np.nan)
+    columns = [*arrays["known_normal"].T, noise]
+    return {name: column * known for name, column in zip(names, columns, strict=True)}
 
 
 def exported_archive(recording: Recording, steps: str | None) -> Exported:
@@ -329,10 +349,11 @@ def run(given: argparse.Namespace) -> int:
     if given.what == "points" and file_format != "json":
         lower, upper = recording.start.workspace.lower, recording.start.workspace.upper
         bounds = ",".join(f"[{a!r},{b!r}]" for a, b in zip(lower, upper, strict=True))
+        normals = " session.normals=file" if "nx" in exported.table else ""
         console.print(
             f"probe with these: python -m runners.probe object=NAME session=points "
             f"session.path={path} 'session.workspace=[{bounds}]' "
-            f"session.free_resolution={recording.start.free_resolution!r}",
+            f"session.free_resolution={recording.start.free_resolution!r}{normals}",
         )
     return 0
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import math
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +20,15 @@ from chsel.errors import (
     PointsWarning,
     PoseError,
     SettingError,
+    require_choice,
     require_positive,
 )
 from chsel.events import Probe, Start
 from chsel.numerics.arrays import FloatArray, IntArray, frozen, read_npz, refuse_special_file
 from chsel.problem.points import (
     FREE_RESOLUTION,
+    NEAR_UNIT,
+    NORMAL_NOISE,
     POINT_CLASSES,
     KnownPoints,
     Workspace,
@@ -32,6 +37,7 @@ from chsel.problem.points import (
     check_workspace,
     distinct_points,
     same_place,
+    unit_normals,
     workspace_around,
     world_points,
 )
@@ -40,6 +46,8 @@ from chsel.problem.sdf_grid import OBJECT_PADDING
 from chsel.problem.streams import LAST_STEP
 from runners.objects.loader import ObjectModel
 from runners.sessions.source import ObjectOrigin, ProbeSource, SourceKind
+
+NORMALS = ("none", "file")
 
 
 @dataclass(frozen=True)
@@ -59,8 +67,17 @@ class PointsSettings:
     object_padding: float = OBJECT_PADDING  # of the SDF grid, metres
     start_contacts: int = 0  # a registration needs so many contacts
     start_probe: int = 0  # and this index of the probe
+    normals: str = "none"
+    """NORMALS: "file" reads the normals of the file, "none" leaves them out."""
+    normal_noise: float = NORMAL_NOISE
+    """Root mean square angle by which they are off where the file does not say, radians."""
 
     def __post_init__(self) -> None:
+        require_choice("normals", self.normals, accepted=NORMALS)
+        require_positive("normal_noise", self.normal_noise)
+        if self.normal_noise > math.pi:
+            text = "in degrees? accepted: above 0, up to pi, radians"
+            raise SettingError(f"normal_noise is {self.normal_noise:g}; {text}")
         require_positive("free_resolution", self.free_resolution)
         if not self.path:
             raise SettingError("path is missing; pass session.path=FILE, a file of known points")
@@ -78,7 +95,8 @@ class PointsSource(ProbeSource):
 
     def __init__(self, settings: PointsSettings, object_model: ObjectModel) -> None:
         assert settings.path is not None
-        self._file = read_points(settings.path)
+        noise = settings.normal_noise if settings.normals == "file" else None
+        self._file = read_points(settings.path, normal_noise=noise)
         self._steps = np.unique(self._file.steps).tolist()
         self.free_resolution = settings.free_resolution
         self.world_from_object = self._file.world_from_object
@@ -86,6 +104,9 @@ class PointsSource(ProbeSource):
         self.count = len(self._steps)
         self.start = Start(contacts=settings.start_contacts, step=settings.start_probe)
         self.warnings: list[PointsWarning] = []
+        if self._file.has_unread_normals:
+            text = f"point file {settings.path} has normals, which are not used; session.normals="
+            self.warnings.append(PointsWarning("normals_unused", f"{text}file uses them"))
         self._points: list[KnownPoints] = []  # of each step
         every = KnownPoints()
         diameter = object_model.diameter
@@ -114,9 +135,14 @@ class PointsSource(ProbeSource):
     def probes(self) -> Iterator[Probe]:
         """Yield one probe per step of the file."""
         for step, points in zip(self._steps, self._points, strict=True):
-            contacts = self._file.at(step).contacts
+            found = self._file.at(step)
+            found = found.with_known(found.sdf == 0.0)
             yield Probe(
-                step, "points", new_points=points, contacts=contacts, contact_normals=0.0 * contacts
+                step,
+                "points",
+                new_points=points,
+                contacts=found.known,
+                contact_normals=found.normals,
             )
 
     def close(self) -> None:
@@ -135,8 +161,14 @@ POINTS = SourceKind(PointsSettings, open_points, object=ObjectOrigin.REAL)
 
 
 KINDS = ("surface", *POINT_CLASSES)
+_WITH_NORMALS = ("surface", "known")
+_OF_NORMALS = ("normal", "normal_noise")  # behind these in names of arrays
 _COLUMNS = ["x", "y", "z", "kind", "sdf", "step"]
-_ACCEPTED = "x, y, z[, kind[, sdf]][, step], commas between them, decimal points in numbers"
+_NORMAL = ["nx", "ny", "nz"]
+_ACCEPTED = (
+    "x, y, z[, kind[, sdf]][, step][, nx, ny, nz[, normal_noise]], commas between them, decimal "
+    "points in numbers"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +179,9 @@ class PointFile:
     points: FloatArray  # (N, 3), world, metres
     sdf: FloatArray  # (N,), metres; that of known points alone counts
     steps: IntArray  # (N,): at which each becomes known
+    normals: FloatArray  # (N, 3), unit, out of the object, world; 0 where none is known or read
+    normal_noise: FloatArray  # (N,), root mean square angle, radians; 0 where there is no normal
+    has_unread_normals: bool = False
     world_from_object: FloatArray | None = None  # (4, 4): the true pose, where it is given
 
     def at(self, step: int) -> KnownPoints:
@@ -157,13 +192,19 @@ class PointFile:
         known = np.concatenate([surface, known])
         points = self.points
         return KnownPoints(
-            points[free], points[occupied], known=points[known], known_sdf=self.sdf[known]
+            points[free],
+            points[occupied],
+            known=points[known],
+            known_sdf=self.sdf[known],
+            normals=self.normals[known],
+            normal_noise=self.normal_noise[known],
         )
 
 
-def read_points(path: str | Path) -> PointFile:
+def read_points(path: str | Path, *, normal_noise: float | None = None) -> PointFile:
     """Read .npz, .csv, or the vertices of .ply, .off, .xyz and .stl as surface points.
 
+    normal_noise: of normals about which the file does not say it, radians; None: read no normals.
     Raise PointsError, which names the file and the array or row, for anything malformed.
     """
     path = Path(path).expanduser()
@@ -176,7 +217,9 @@ def read_points(path: str | Path) -> PointFile:
         raise PointsError(f"point file {path} does not exist; accepted: a file")
     refuse_special_file(f"point file {path}", path, error=PointsError)
     try:
-        content = reader(path)
+        content = reader(path, normal_noise)
+        if normal_noise is not None and not content.normal_noise.any():
+            raise PointsError("it has no normals; accepted: session.normals=none")
         if len(content.points) == 0:
             raise PointsError("it holds no points; accepted: at least one")
         world_points("points", content.points)  # raises for what is far beyond a robot's reach
@@ -188,8 +231,10 @@ def read_points(path: str | Path) -> PointFile:
     return content
 
 
-def _read_npz(path: Path) -> PointFile:
+def _read_npz(path: Path, normal_noise: float | None) -> PointFile:
+    of_normals = [f"{kind}_{name}" for kind in _WITH_NORMALS for name in _OF_NORMALS]
     accepted = [*KINDS, "known_sdf", *(f"{kind}_step" for kind in KINDS), "world_from_object"]
+    accepted += of_normals
     arrays = read_npz(path, accepted=accepted, error=PointsError)
     given = [kind for kind in KINDS if kind in arrays]
     if not given:
@@ -200,13 +245,28 @@ def _read_npz(path: Path) -> PointFile:
     if pose is not None:
         pose = frozen("world_from_object", pose, shape=(4, 4), error=PoseError)
         pose = nearest_rigid("world_from_object", pose[None])[0]
-    parts = [_npz_part(kind, arrays) for kind in given]
-    kinds, points, sdf, steps = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return PointFile(kinds, points, sdf=sdf, steps=steps, world_from_object=pose)
+    for kind, name in product(_WITH_NORMALS, _OF_NORMALS):
+        if f"{kind}_{name}" in arrays and kind not in given:
+            raise PointsError(f"{kind}_{name} has no {kind}; accepted: both, or none")
+    parts = [_npz_part(kind, arrays, normal_noise=normal_noise) for kind in given]
+    columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+    kinds, points, sdf, steps, normals, noise = columns
+    return PointFile(
+        kinds,
+        points,
+        sdf=sdf,
+        steps=steps,
+        normals=normals,
+        normal_noise=noise,
+        has_unread_normals=normal_noise is None and any(name in arrays for name in of_normals),
+        world_from_object=pose,
+    )
 
 
-def _npz_part(kind: str, arrays: dict[str, Any]) -> tuple[np.ndarray, ...]:
-    """Return kinds, points, signed distances and steps of one array of points."""
+def _npz_part(
+    kind: str, arrays: dict[str, Any], *, normal_noise: float | None
+) -> tuple[np.ndarray, ...]:
+    """Return kinds, points, distances, steps, normals and their noise of one array of points."""
     points = frozen(kind, arrays[kind], shape=(None, 3))
     nothing = np.zeros(len(points), dtype=np.int64)
     sdf = frozen(
@@ -218,10 +278,16 @@ def _npz_part(kind: str, arrays: dict[str, Any]) -> tuple[np.ndarray, ...]:
             f"{kind}_step has type {steps.dtype} and shape {steps.shape}; accepted: integers, "
             f"shape {nothing.shape}"
         )
-    return np.full(len(points), kind), points, sdf, steps.astype(np.int64)
+    given = noise = None
+    if normal_noise is not None:
+        given, noise = (arrays.get(f"{kind}_{name}") for name in _OF_NORMALS)
+    if given is not None and noise is None:
+        noise = normal_noise
+    normals, noise = unit_normals(f"{kind}_normal", given, noise=noise, count=len(points))
+    return np.full(len(points), kind), points, sdf, steps.astype(np.int64), normals, noise
 
 
-def _read_csv(path: Path) -> PointFile:
+def _read_csv(path: Path, normal_noise: float | None) -> PointFile:
     import pandas as pd
 
     try:
@@ -231,19 +297,22 @@ def _read_csv(path: Path) -> PointFile:
         raise PointsError(_wrong_length(path) or _unreadable(".csv", error)) from None
     table.columns = table.columns.str.strip()
     with_kind = "kind" in table
-    if not set("xyz") <= set(table) <= set(_COLUMNS) or ("sdf" in table and not with_kind):
+    of_normals = set(table) & {*_NORMAL, "normal_noise"}
+    if (
+        not set("xyz") <= set(table) - of_normals <= set(_COLUMNS)
+        or ("sdf" in table and not with_kind)
+        or (of_normals and not of_normals >= set(_NORMAL))
+    ):
         raise PointsError(f"its columns are {', '.join(table.columns)}; accepted: {_ACCEPTED}")
     if not with_kind:
         table["kind"] = "surface"
+    directions = table.reindex(columns=[*_NORMAL, "normal_noise"])
     table = table.reindex(columns=_COLUMNS)
     kinds = table.pop("kind").astype(str).str.strip().to_numpy()
     known = kinds == "known"
     given = table["sdf"].notna().to_numpy()
     table = table.fillna({"sdf": 0.0, "step": 0.0})
-    try:
-        numbers = table.to_numpy(float)
-    except ValueError:
-        raise PointsError(_not_a_number(table)) from None
+    numbers = _numbers(table)
     points = numbers[:, :3]
     sdf = numbers[:, 3]
     steps = numbers[:, 4]
@@ -259,7 +328,54 @@ def _read_csv(path: Path) -> PointFile:
     if not with_kind:
         text = f"point file {path} has no column kind: its points are read as points on the object"
         warnings.warn(PointsWarning("kind", text), stacklevel=2)
-    return PointFile(kinds, points, sdf=sdf, steps=steps.astype(np.int64))
+    if normal_noise is None:
+        directions[:] = np.nan
+    normals, noise = _csv_normals(directions, normal_noise, kinds=kinds)
+    return PointFile(
+        kinds,
+        points,
+        sdf=sdf,
+        steps=steps.astype(np.int64),
+        normals=normals,
+        normal_noise=noise,
+        has_unread_normals=normal_noise is None and bool(of_normals),
+    )
+
+
+def _csv_normals(
+    table: Any, normal_noise: float | None, *, kinds: np.ndarray
+) -> tuple[FloatArray, FloatArray]:
+    """Return normals (N, 3) and their noise (N,) of columns nx, ny, nz and normal_noise.
+
+    Empty cells: no normal, or a noise of normal_noise, radians. Raise PointsError, which names the
+    row, for a malformed one.
+    """
+    given = table.notna().to_numpy()
+    default = NORMAL_NOISE if normal_noise is None else normal_noise
+    numbers = _numbers(table.fillna(dict.fromkeys(_NORMAL, 0.0) | {"normal_noise": default}))
+    normals, noise = numbers[:, :3], numbers[:, 3]
+    known = (normals != 0.0).any(axis=1)
+    length = np.sqrt((normals**2).sum(axis=1))
+    with_normals = np.isin(kinds, _WITH_NORMALS)
+    bad_noise = (noise < 0.0) | (noise > math.pi) | (known & (noise == 0.0))
+    for wrong, what in (
+        (~np.isfinite(numbers).all(axis=1), "one of nx, ny, nz and normal_noise is not finite"),
+        (given[:, :3].any(axis=1) & ~given[:, :3].all(axis=1), "one of nx, ny, nz is missing"),
+        (known & (np.abs(length - 1.0) > NEAR_UNIT), "nx, ny, nz is no unit vector"),
+        (known & ~with_normals, f"a normal, but kind is none of {', '.join(_WITH_NORMALS)}"),
+        (bad_noise, "normal_noise is not above 0, up to pi, radians"),
+    ):
+        if wrong.any():
+            raise PointsError(f"row {np.argmax(wrong) + 1}: {what}")
+    return unit_normals("normals", normals, noise=noise, count=len(normals))
+
+
+def _numbers(table: Any) -> FloatArray:
+    """Return the numbers of a table; raise PointsError for the first value that is none."""
+    try:
+        return np.asarray(table.to_numpy(float))
+    except ValueError:
+        raise PointsError(_not_a_number(table)) from None
 
 
 def _wrong_length(path: Path) -> str:
@@ -291,22 +407,52 @@ def _unreadable(suffix: str, error: Exception) -> str:
     return f"not a readable {suffix} file ({reason[:200]})"
 
 
-def _read_surface(path: Path) -> PointFile:
-    """Return every vertex of a mesh or point cloud as a surface point, each place once."""
+def _read_surface(path: Path, normal_noise: float | None) -> PointFile:
+    """Return every vertex of a mesh or point cloud as a surface point, each place once.
+
+    Normals are those of the vertices of a .ply file alone.
+    """
     import trimesh
 
     kind = path.suffix.lower().removeprefix(".")
+    directions = None
     try:
         loaded = trimesh.load(str(path), file_type=kind, process=False)
         geometries = list(getattr(loaded, "geometry", {"": loaded}).values())
-        vertices = np.concatenate([_vertices(geometry) for geometry in geometries])
+        if kind == "ply":
+            directions = _ply_normals(geometries[0])
+        if directions is None or normal_noise is None:
+            vertices = np.concatenate([_vertices(geometry) for geometry in geometries])
+        else:
+            vertices = np.asarray(geometries[0].vertices, dtype=np.float64).reshape(-1, 3)
     except Exception as error:  # readers of foreign formats raise anything
         raise PointsError(_unreadable(f".{kind}", error)) from None
     points = frozen("surface", vertices, shape=(None, 3))
+    unread = normal_noise is None and directions is not None
+    normals, noise = unit_normals("normals", None, noise=None, count=len(points))
+    if directions is not None and normal_noise is not None:
+        normals, noise = unit_normals("normals", directions, noise=normal_noise, count=len(points))
+        first = np.sort(np.unique(points, axis=0, return_index=True)[1])
+        points, normals, noise = points[first], normals[first], noise[first]
     nothing = np.zeros(len(points), dtype=np.int64)
     return PointFile(
-        np.full(len(points), "surface"), points, sdf=nothing.astype(float), steps=nothing
+        np.full(len(points), "surface"),
+        points,
+        sdf=nothing.astype(float),
+        steps=nothing,
+        normals=normals,
+        normal_noise=noise,
+        has_unread_normals=unread,
     )
+
+
+def _ply_normals(geometry: Any) -> FloatArray | None:
+    """Return the normals (V, 3) that a .ply file states of its vertices; None if it has none."""
+    data = geometry.metadata["_ply_raw"]["vertex"]["data"]
+    names = data if isinstance(data, dict) else data.dtype.names
+    if not set(_NORMAL) <= set(names):
+        return None
+    return np.stack([np.asarray(data[name], np.float64).reshape(-1) for name in _NORMAL], axis=1)
 
 
 def _vertices(geometry: Any) -> FloatArray:
@@ -321,7 +467,7 @@ def _vertices(geometry: Any) -> FloatArray:
     return np.concatenate([np.asarray(geometry.vertices).reshape(-1, 3), beside])
 
 
-_READERS: dict[str, Callable[[Path], PointFile]] = {
+_READERS: dict[str, Callable[[Path, float | None], PointFile]] = {
     ".npz": _read_npz,
     ".csv": _read_csv,
     **dict.fromkeys((".ply", ".off", ".xyz", ".stl"), _read_surface),

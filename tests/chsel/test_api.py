@@ -43,6 +43,32 @@ def test_contacts_are_points_on_the_surface_and_have_a_name():
         chsel.register(BOX, SURFACE)
 
 
+def test_normals_of_contacts_are_those_of_the_problem(monkeypatch):
+    posed = []
+    pose_problem = chsel.api.posed_problem
+
+    def spied(sdf, points, **named):
+        posed.append(points)
+        return pose_problem(sdf, points, **named)
+
+    monkeypatch.setattr(chsel.api, "posed_problem", spied)
+    repeated = np.concatenate([SURFACE[:3], SURFACE[:1]])
+    normals = [[0, 0, 1], [0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    register(
+        contacts=repeated,
+        normals=normals,
+        normal_noise=[0.1, 0.2, 0.3, 0.4],
+        known=POINT,
+        known_sdf=[0.0],
+    )
+    (points,) = posed
+    np.testing.assert_array_equal(points.normals, [*normals[:3], [0, 0, 0]])
+    np.testing.assert_array_equal(points.normal_noise, [0.1, 0.0, 0.3, 0.0])
+    for wrong in ({"normals": normals}, {"contacts": POINT, "normal_noise": 0.1}):
+        with pytest.raises(chsel.ChselError, match="normals"):
+            register(**wrong)
+
+
 def test_a_grid_that_is_kept_a_mesh_lists_and_tensors_give_the_same_bits(monkeypatch):
     grid = chsel.SdfGrid.from_mesh(BOX, 0.002)
     digest = register(contacts=SURFACE).digest

@@ -28,7 +28,10 @@ def test_the_true_object_comes_first(tmp_path):
     free = around[(np.abs(in_box) > 0.5 * BOX_SIDES + 0.02).any(axis=1)]
     meshes = {"slim": slim, "box": BOX}
     with chsel.WhichObject(meshes, record=tmp_path / "touches.mcap") as which:
-        which.add(contacts=contacts, free=free)
+        which.add(contacts=contacts[:1], normals=[[0, 0, 1]])
+        which.add(contacts=contacts[1:], free=free)
+        shared = [session.points.normals for session in which.sessions.values()]
+        np.testing.assert_array_equal(shared, [[[0, 0, 1], *np.zeros((11, 3))]] * 2)
         first, second = which.register()
     assert (first.name, second.name) == ("box", "slim")
     assert first.alive

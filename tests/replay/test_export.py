@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
+import chsel
 from chsel.errors import SettingError
 from chsel.events import (
     Believed,
@@ -22,7 +24,7 @@ from chsel.events import (
     SnapshotTaken,
 )
 from chsel.problem.points import KnownPoints
-from chsel.problem.poses import inverse
+from chsel.problem.poses import axis_angle, inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import object_grid
 from chsel.problem.streams import StreamKey
@@ -85,6 +87,39 @@ def test_a_points_session_on_exported_points_has_the_recorded_problems(recording
     if file_format == "npz":
         truth = recording.start.world_from_object
         np.testing.assert_allclose(session.world_from_object, truth, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("file_format", ["npz", "csv"])
+def test_exported_normals_are_read_where_they_are_asked_for(tmp_path, capsys, file_format):
+    box = trimesh.creation.box((0.1, 0.06, 0.2))
+    contacts, faces = trimesh.sample.sample_surface(box, 9, seed=0)
+    normals = np.asarray(box.face_normals)[faces] @ axis_angle(np.array([0.6, 0.0, 0.8]), 0.7)
+    normals[7] = 0.0
+    with chsel.Session(box, record=tmp_path / "touches.mcap") as session:
+        session.add(contacts=contacts[:3], normals=normals[:3], normal_noise=[0.1, 0.2, 0.3])
+        session.add(contacts=contacts[3:6], free=[[0.3, 0.3, 0.3]], occupied=[[0, 0, 0]])
+        session.add(contacts=contacts[6:], normals=1.004 * normals[6:])
+        diameter = session.started.sdf.diameter
+        workspace = tuple(zip(*session.started.workspace.bounds.tolist(), strict=True))
+    recording = read_recording(tmp_path / "touches.mcap")
+    path = exported(recording, "points", file_format)
+    assert "session.normals=file" in capsys.readouterr().out
+    model: Any = SimpleNamespace(diameter=diameter)
+    source = PointsSource(PointsSettings(str(path), workspace, normals="file"), model)
+    assert source.warnings == []
+    for probe, original in zip(source.probes(), recording.probes, strict=True):
+        assert probe.new_points.digest == original.new_points.digest
+        assert same_bits(probe.new_points.normals, original.new_points.normals)
+        assert same_bits(probe.contact_normals, original.contact_normals)
+    assert probe.new_points.normal_noise.tolist() == [0.25, 0.0, 0.25]
+    source = PointsSource(PointsSettings(str(path), workspace), model)
+    assert [warning.code for warning in source.warnings] == ["normals_unused"]
+    for probe, original in zip(source.probes(), recording.probes, strict=True):
+        assert same_bits(probe.new_points.known, original.new_points.known)
+        assert not probe.new_points.has_normals
+    assert list(arrays(recording, "points", "--steps", "1")) == [
+        *("known_sdf", "free", "free_step", "occupied", "occupied_step", "known", "known_step")
+    ]
 
 
 def test_points_of_single_steps_are_those_that_came_with_them(recording):

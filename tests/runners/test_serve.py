@@ -111,6 +111,22 @@ def test_two_clients_at_once_get_what_the_library_gives_and_recordings_repeat(se
         assert outcomes(folder / f"client_{number}.mcap") == ([0, 0, 1], "finished")
 
 
+def test_normals_are_recorded_as_those_of_the_library(server):
+    address, folder = server
+    path = opened(address, record="normals.mcap")
+    normals = [[0, 0, 1], [0, 0, 0], [0, 1.005, 0]]
+    given = {"contacts": ON_BOX[:3], "normals": normals, "normal_noise": [0.1, 0, 0.3]}
+    assert ask(address, f"{path}/add", **given)[0] == 200
+    touch = {"contact": ON_BOX[3], "normal": [-1, 0, 0], "normal_noise": 0.2}
+    assert ask(address, f"{path}/add", **touch)[0] == 200
+    ask(address, f"{path}/close", body=b"")
+    probes = read_recording(folder / "normals.mcap").probes
+    points = chsel.KnownPoints.joined([probe.new_points for probe in probes])
+    expected = [[0, 0, 1], [0, 0, 0], [0, 1, 0], [-1, 0, 0]]
+    np.testing.assert_allclose(points.normals, expected, atol=1e-15)
+    np.testing.assert_array_equal(points.normal_noise, [0.1, 0.0, 0.3, 0.2])
+
+
 def test_others_are_answered_during_a_registration_and_its_own_session_waits(server, monkeypatch):
     address, _ = server
     path, other = opened(address), opened(address)
@@ -157,7 +173,19 @@ def test_a_mistake_is_one_line(server):
         ("/add", {"free": "x"}, "free is not an array of numbers; accepted: nested lists"),
         ("/add", {"free": packed([3, 3])}, "free is not an array of numbers; accepted"),
         ("/add", {"contact": [0, 0, None]}, "contact[2] is not finite"),
-        ("/add", {"contcts": []}, "a name in add is 'contcts'; accepted: contacts, free"),
+        ("/add", {"contcts": []}, "a name in add is 'contcts'; accepted: contacts, normals"),
+        ("/add", {"normals": [[0, 0, 1]]}, "normals have no contacts; accepted: both"),
+        (
+            "/add",
+            {"contacts": [[0, 0, 1]], "normals": [[0, 0, 1.02]]},
+            "normals[0] is 1.02 long; accepted: unit vectors out of the object",
+        ),
+        (
+            "/add",
+            {"contact": [0, 0, 1], "normal": [0, 0, 1], "normal_noise": 15},
+            "normal_noise is 15; in degrees? accepted: above 0, up to pi, radians",
+        ),
+        ("/add", {"contact": [0, 0, 1], "normal": [0, None, 1]}, "normal[1] is not finite"),
         ("/register", {}, "nothing is known yet; accepted: a registration after `add`"),
         ("/next_probe", {"length": [1]}, "actions are incomplete; accepted:"),
     ):

@@ -16,6 +16,7 @@ from chsel.problem.points import (
     distinct_points,
     first_at_place,
     same_place,
+    unit_normals,
 )
 
 
@@ -47,6 +48,42 @@ def test_tensors_are_taken():
 def test_malformed_points_are_named(arrays, message):
     with pytest.raises(PointsError, match=message):
         KnownPoints(**arrays)
+
+
+def test_normals_that_are_unit_keep_their_bits_and_others_become_unit():
+    """So that those of a recording are the same after they were exported and read."""
+    random = np.random.default_rng(0)
+    given = random.normal(size=(200, 3))
+    once, _ = unit_normals(
+        "n", given / np.linalg.norm(given, axis=1)[:, None], noise=0.1, count=200
+    )
+    again, noise = unit_normals("n", once, noise=None, count=200)
+    np.testing.assert_array_equal(again, once)
+    np.testing.assert_array_equal(noise, 0.25)
+    longer, _ = unit_normals("n", 1.009 * once, noise=0.1, count=200)
+    np.testing.assert_allclose(longer, once, atol=1e-15)
+    KnownPoints(known=given, normals=longer, normal_noise=noise)
+
+
+def test_the_sign_of_zero_is_not_part_of_a_digest():
+    normals = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+    digests = {
+        KnownPoints(known=np.eye(3)[:2], normals=given, normal_noise=[0.1, 0.0]).digest
+        for given in (normals, np.where(normals == 0.0, -0.0, normals))
+    }
+    assert len(digests) == 1
+
+
+def test_noise_counts_where_there_is_a_normal():
+    _, noise = unit_normals("n", [[0, 0, 1], [0, 0, 0]], noise=[0.2, 0.0], count=2)
+    np.testing.assert_array_equal(noise, [0.2, 0.0])
+    _, noise = unit_normals("n", [[0, 0, 1], [0, 0, 0]], noise=0.3, count=2)
+    np.testing.assert_array_equal(noise, [0.3, 0.0])
+    for wrong, message in (([0.0, 0.1], "is 0; accepted"), ([0.1, 9.0], "is 9; in degrees")):
+        with pytest.raises(PointsError, match=message):
+            unit_normals("n", [[0, 0, 1], [0, 0, 0]], noise=wrong, count=2)
+    with pytest.raises(PointsError, match=r"n\[0\] is 0 long; accepted: unit vectors"):
+        unit_normals("n", [[1e-200, 0, 0]], noise=0.1, count=1)
 
 
 def test_points_without_a_name_and_a_workspace_of_one_corner_are_refused():

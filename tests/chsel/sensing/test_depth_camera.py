@@ -2,13 +2,17 @@
 
 import numpy as np
 import pytest
+import trimesh
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from chsel.errors import SettingError
+from chsel.problem.poses import axis_angle, compose
 from chsel.sensing.depth_camera import (
     PinholeCamera,
     depth_regions,
     main_regions,
     occlusion_edges,
+    pixel_normals,
     point_regions,
     speckle_free,
     valid_pixels,
@@ -36,6 +40,117 @@ def test_points_project_back_onto_their_pixels():
 def test_what_no_camera_has_is_refused(values, message):
     with pytest.raises(SettingError, match=message):
         PinholeCamera(*values)
+
+
+WIDE = PinholeCamera(120, 90, fx=150.0, fy=160.0, cx=58.3, cy=46.1)
+RAYS = WIDE.directions()
+UPRIGHT = compose(axis_angle(np.array([0.6, 0.64, 0.48]), 0.9), np.array([0.01, -0.02, 0.4]))
+
+
+def every_normal(depth, counts, reach):
+    normals = np.zeros((*depth.shape, 3))
+    pixels = np.argwhere(counts)
+    found = pixel_normals(depth, counts, pixels=pixels, camera=WIDE, reach=reach)
+    normals[tuple(pixels.T)] = found
+    return normals, normals.any(axis=-1)
+
+
+def angles(one, other):
+    return 2.0 * np.arcsin(np.minimum(np.linalg.norm(one - other, axis=-1) / 2.0, 1.0))
+
+
+@pytest.mark.parametrize("reach", [1, 2, 6])
+def test_a_plane_has_its_normal_at_each_pixel_but_the_corners(reach):
+    towards = np.array([0.3, -0.5, -0.8]) / np.sqrt(0.98)
+    depth = -0.4 / (RAYS @ towards)
+    counts = np.ones(depth.shape, dtype=bool)
+    counts[20:50, 30] = False
+    normals, given = every_normal(depth, counts, reach)
+    assert given[reach:-reach, 35:-reach].all()
+    assert given[counts].mean() > 0.97
+    assert not given[[0, 0, -1, -1], [0, -1, 0, -1]].any()
+    np.testing.assert_allclose(normals[given], np.tile(towards, (given.sum(), 1)), atol=1e-10)
+    np.testing.assert_allclose(np.linalg.norm(normals[given], axis=1), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("reach", [1, 3])
+def test_the_normals_of_a_ball_are_those_of_its_surface(reach):
+    """A ball of 60 mm at 0.4 m, of 2.6 mm a pixel, as of the intersection of rays with it."""
+    centre, radius = np.array([0.02, -0.03, 0.4]), 0.06
+    along = RAYS @ centre
+    squared = (RAYS**2).sum(axis=-1)
+    root = along**2 - squared * (centre @ centre - radius**2)
+    hit = root > 0.0
+    depth = np.where(hit, (along - np.sqrt(np.maximum(root, 0.0))) / squared, 0.7)
+    true = (RAYS * depth[..., None] - centre) / radius
+    normals, given = every_normal(depth, hit, reach)
+    facing = -(true * RAYS).sum(axis=-1) / np.sqrt(squared)  # cosine of the angle to the ray
+    middle = hit & (facing > 0.5)
+    assert given[middle].mean() > 0.98
+    assert angles(normals, true)[given & middle].max() < 0.08
+    assert angles(normals, true)[given & hit & (facing > 0.8)].max() < 0.02
+    assert angles(normals, true)[given & hit].max() < 0.35
+
+
+@pytest.mark.parametrize("reach", [1, 2, 4])
+def test_a_box_has_the_normals_of_its_faces_and_none_across_its_edges(reach):
+    """The box of the mesh, by slabs; an edge is where another face is within reach."""
+    mesh = trimesh.creation.box((0.12, 0.08, 0.2))
+    half = 0.5 * mesh.extents
+    rotation = UPRIGHT[:3, :3]
+    origin = -UPRIGHT[:3, 3] @ rotation
+    ends = (np.array([-half, half])[:, None, None] - origin) / (RAYS @ rotation)
+    enters = ends.min(axis=0)
+    depth = enters.max(axis=-1)
+    hit = (depth < ends.max(axis=0).min(axis=-1)) & (depth > 0.0)
+    axis = enters.argmax(axis=-1)
+    sides = np.sign(RAYS @ rotation)
+    local = -np.take_along_axis(sides, axis[..., None], axis=-1) * np.eye(3)[axis]
+    points = (RAYS * depth[..., None])[hit] @ rotation + origin
+    _, away, face = mesh.nearest.on_surface(points)
+    assert away.max() < 1e-9
+    inner = np.sort(np.abs(points) / half, axis=1)[:, 1] < 0.99  # on a single face
+    np.testing.assert_allclose(mesh.face_normals[face][inner], local[hit][inner], atol=1e-9)
+    normals, given = every_normal(depth, hit, reach)
+    true = local @ rotation.T
+    alone = hit & (minimum_filter(np.where(hit, axis, -1), 2 * reach + 1) == axis)
+    alone &= maximum_filter(np.where(hit, axis, 9), 2 * reach + 1) == axis
+    assert len(np.unique(axis[hit])) == 3
+    assert given[alone].all()
+    assert angles(normals, true)[alone].max() < 1e-7
+    edges = hit & ~alone
+    assert angles(normals, true)[edges & given].max() < 0.3
+    assert 0.1 < given[edges].mean() < 0.9
+
+
+@pytest.mark.parametrize("step", [0.004, 0.01, 0.015, 0.1])
+@pytest.mark.parametrize("reach", [1, 3])
+def test_no_normal_is_across_a_jump_of_depth(step, reach):
+    """Two walls, both looking at the camera, of which one is behind the other."""
+    depth = np.full((90, 120), 0.4)
+    depth[:, 50:] += step
+    counts = np.ones(depth.shape, dtype=bool)
+    normals, given = every_normal(depth, counts, reach)
+    true = np.broadcast_to([0.0, 0.0, -1.0], normals.shape)
+    assert given[reach:-reach, np.r_[reach : 50 - 2 * reach, 50 + 2 * reach : 110]].all()
+    assert angles(normals, true)[given].max() < 0.25
+    if step > 0.012:  # more than a steep surface has: each side has its own normals
+        assert angles(normals, true)[given].max() < 1e-9
+        assert given[reach:-reach, reach:-reach].all()
+
+
+def test_normals_of_noisy_depths_are_as_good_as_their_window_allows():
+    """Of a plane: about each axis sigma / sqrt(S), S being the sum of squared offsets in metres."""
+    random = np.random.default_rng(0)
+    depth = 0.4 + random.normal(0.0, 0.001, (90, 120))
+    counts = np.ones(depth.shape, dtype=bool)
+    normals, given = every_normal(depth, counts, 4)
+    pixel = 0.4 / 155.0
+    expected = np.sqrt(2.0) * 0.001 / (pixel * np.sqrt(9 * 60.0))  # 9 rows of 2 (1 + 4 + 9 + 16)
+    inner = given[4:-4, 4:-4]
+    assert inner.all()
+    off = angles(normals, np.array([0.0, 0.0, -1.0]))[4:-4, 4:-4]
+    assert np.sqrt((off**2).mean()) == pytest.approx(expected, rel=0.1)
 
 
 def test_only_depths_within_the_range_are_valid():

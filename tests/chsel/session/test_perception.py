@@ -51,6 +51,41 @@ def codes(session):
     return [warning.code for warning in session.warnings]
 
 
+def test_points_of_an_image_have_normals_where_they_are_asked_for(tmp_path):
+    """Those of the box's faces; none at corners of the mask, at edges none, or one between."""
+    path = tmp_path / "look.mcap"
+    with chsel.Session(BOX, record=path) as session:
+        session.add(depth=depths(2.0), **SEEN, image_normal_noise=0.2)
+    points = session.points
+    bare = added(depth=depths(2.0), **SEEN).points
+    np.testing.assert_array_equal(points.known, bare.known)
+    assert not bare.has_normals
+    places = np.abs(apply(inverse(TRUTH), points.known)) / (0.5 * SIDES)
+    face = places.argmax(axis=1)
+    given = points.normals.any(axis=1)
+    local = points.normals @ TRUTH[:3, :3]
+    signs = np.sign(apply(inverse(TRUTH), points.known))
+    cosine = (local * signs)[np.arange(len(face)), face]
+    inner = np.sort(places, axis=1)[:, 1] < 0.8
+    assert inner.sum() > 20
+    assert given[inner].mean() > 0.9
+    np.testing.assert_allclose(cosine[inner & given], 1.0, atol=1e-9)
+    assert cosine[given].min() > np.cos(0.3)
+    np.testing.assert_array_equal(points.normal_noise, np.where(given, 0.2, 0.0))
+    (probe,) = read_recording(path).probes
+    assert probe.new_points.digest == points.digest
+    image = {"depth": depths(2.0), **SEEN}
+    without = {name: value for name, value in image.items() if name != "mask"}
+    session = chsel.Session(BOX)
+    for what, text in (
+        (image | {"image_normal_noise": 12}, "image_normal_noise is 12; in degrees"),
+        (image | {"image_normal_noise": 0.0}, "image_normal_noise is 0; accepted: above 0"),
+        (image | {"image_normal_noise": [0.1, 0.2]}, "image_normal_noise has shape"),
+        (without | {"image_normal_noise": 0.2}, "image_normal_noise has no mask"),
+    ):
+        refused(text, session.add, **what)
+
+
 FARTHEST = float(np.finfo(np.float32).max)
 
 

@@ -17,7 +17,9 @@ from tests.chsel.samples import box_distance
 SIDES = np.array([0.12, 0.08, 0.2])
 BOX = trimesh.creation.box(SIDES)
 TRUTH = compose(axis_angle(np.array([0.0, 0.0, 1.0]), 0.3), np.array([0.4, 0.1, 0.1]))
-CONTACTS = apply(TRUTH, np.asarray(trimesh.sample.sample_surface(BOX, 20, seed=0)[0]))
+SAMPLED, FACES = trimesh.sample.sample_surface(BOX, 20, seed=0)
+CONTACTS = apply(TRUTH, np.asarray(SAMPLED))
+NORMALS = np.asarray(BOX.face_normals)[FACES] @ TRUTH[:3, :3].T
 HAND = trimesh.creation.box((0.01, 0.01, 0.06))
 CAMERA = chsel.PinholeCamera(80, 60, fx=90.0, fy=90.0, cx=39.5, cy=29.5)
 LOOK = compose(np.array([[0.0, -0.6, 0.8], [-1.0, 0.0, 0.0], [0.0, -0.8, -0.6]]), [0.0, 0.1, 0.4])
@@ -57,8 +59,60 @@ def test_what_is_added_is_what_is_registered():
     assert session.register().digest == chsel.register(BOX, **others, **given).digest
 
 
+def test_normals_reach_the_problem_the_recording_and_its_reader(tmp_path):
+    """A place that is measured again keeps its first normal; NORMALS[12:] are not known."""
+    path = tmp_path / "touches.mcap"
+    noise = np.linspace(0.1, 0.4, 5)
+    with chsel.Session(BOX, record=path) as session:
+        session.add(contacts=CONTACTS[:5], normals=1.001 * NORMALS[:5], normal_noise=noise)
+        session.add(
+            contacts=CONTACTS[3:8],
+            normals=-NORMALS[3:8],
+            contact=CONTACTS[8],
+            normal=NORMALS[8],
+            normal_noise=0.2,
+        )
+        session.add(contacts=CONTACTS[9:11], normals=NORMALS[9:11], contact=CONTACTS[11])
+        session.register()
+        session.add(contacts=CONTACTS[12:], normals=0.0 * NORMALS[12:])
+        session.register()
+        points = session.problem.points
+    sign = np.ones((20, 1))
+    sign[5:8] = -1.0
+    sign[11:] = 0.0
+    np.testing.assert_array_equal(points.known, CONTACTS)
+    np.testing.assert_allclose(points.normals, sign * NORMALS, atol=1e-12)
+    np.testing.assert_array_equal(
+        points.normal_noise, [*noise, *[0.2] * 4, *[0.25] * 2, *[0.0] * 9]
+    )
+    recording = read_recording(path)
+    assert recording.problem(3).points.digest == points.digest
+    assert [verdict.outcome for verdict in verify(recording)] == [EQUAL] * 2
+    shown = [probe.contact_normals for probe in recording.probes]
+    np.testing.assert_array_equal(shown[1], [*-NORMALS[3:8], NORMALS[8]])
+    np.testing.assert_array_equal(shown[2], [*NORMALS[9:11], np.zeros(3)])
+    assert not shown[3].any()
+
+
+def test_a_push_carries_points_and_keeps_their_normals():
+    session = chsel.Session(BOX, moves=0.01)
+    turned = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # z along x
+    path = compose(np.stack([turned] * 2), np.array([[0.2, 0.1, 0.1], [0.3, 0.1, 0.1]]))
+    session.add(contacts=CONTACTS[:4], normals=NORMALS[:4], normal_noise=0.1)
+    session.add(hand=HAND, path=path, contact=[0.335, 0.1, 0.1], normal=[-1, 0, 0])
+    session.register()
+    points = session.problem.carried(0.01).points
+    np.testing.assert_allclose(
+        points.known[:4], CONTACTS[:4] + np.array([0.01, 0.0, 0.0]), atol=1e-12
+    )
+    np.testing.assert_allclose(points.normals, [*NORMALS[:4], [-1.0, 0.0, 0.0]], atol=1e-12)
+    np.testing.assert_array_equal(points.normal_noise, [*[0.1] * 4, 0.25])
+
+
 DEPTH = {"depth": np.ones((60, 80)), "camera": CAMERA, "world_from_camera": LOOK}
 PATH = TRUTH[None]
+NOISY = {"contacts": CONTACTS, "normals": NORMALS}
+TOUCH = {"contact": CONTACTS[0]}
 OPENING = (
     ({"record": "touches.bag"}, "accepted: a name.mcap or name.rrd"),
     ({"workspace": chsel.Workspace((0, 0, 0), (90, 90, 90))}, "smaller workspace"),
@@ -69,6 +123,21 @@ MISTAKES = (
     ({"contacts": 1000.0 * CONTACTS}, "millimetres"),
     ({"contact": CONTACTS[:1]}, r"contact has shape \(1, 3\)"),
     ({"known": CONTACTS, "known_sdf": [0.0]}, "one per known point, 20"),
+    ({"normals": NORMALS}, "normals have no contacts"),
+    ({"contacts": CONTACTS, "normals": NORMALS[1:]}, "normals has 19 rows; accepted: one per"),
+    ({"contacts": CONTACTS, "normals": 1.02 * NORMALS}, r"normals\[0\] is 1.02 long"),
+    ({"contacts": CONTACTS, "normals": np.nan * NORMALS}, r"normals\[0\] is not finite"),
+    ({"contacts": CONTACTS, "normal_noise": 0.1}, "normal_noise has no normals"),
+    (NOISY | {"normal_noise": 15}, "normal_noise is 15; in degrees"),
+    (NOISY | {"normal_noise": np.full(20, 15.0)}, "normal_noise is 15; in degrees"),
+    (NOISY | {"normal_noise": 0.0}, "normal_noise is 0; accepted: above 0"),
+    (NOISY | {"normal_noise": [0.1, 0.2]}, "normal_noise has 2 entries; accepted: one, or 20"),
+    (NOISY | {"normal_noise": [0.1, [0.2]]}, "normal_noise is not an array of numbers"),
+    (NOISY | {"normal": NORMALS[0]}, "normal has no contact"),
+    (TOUCH | {"normal": NORMALS[:1]}, r"normal has shape \(1, 3\); accepted: \(3\)"),
+    (TOUCH | {"normal": [0, 0, 2]}, r"normal\[0\] is 2 long"),
+    (TOUCH | {"normal_noise": 0.1}, "normal_noise has no normals"),
+    (TOUCH | {"normal": NORMALS[0], "normal_noise": [0.1]}, "is an array beside normal"),
     ({"path": PATH}, "hand and path belong together"),
     ({"hand": chsel.HandShape.of(HAND), "path": PATH}, "accepted: a mesh"),
     ({"hand": HAND, "path": 2.0 * PATH}, r"path\[0\] is not a rigid transform"),

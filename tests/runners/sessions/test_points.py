@@ -1,5 +1,7 @@
 """Sessions of points in files: formats, steps, repeated places and refusals."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -8,6 +10,7 @@ from chsel.errors import PointsError, PointsWarning, SettingError
 from chsel.problem.sdf_grid import object_grid
 from runners.objects.loader import ObjectModel
 from runners.sessions.points import PointsSettings, PointsSource, read_points
+from runners.sessions.probing_settings import without_defaults
 
 BOX = ObjectModel(
     "box", trimesh.creation.box((0.03, 0.04, 0.12)), scale=1.0, epsilon=0.001, configuration="box"
@@ -124,6 +127,158 @@ def test_vertices_beside_the_faces_are_points_too(tmp_path):
     assert sorted(found.tolist()) == expected
     with pytest.raises(PointsError, match=r"surface\[4\] is not finite"):
         read_points(text(tmp_path, off.format("nan"), name="points.off"))
+
+
+NORMALS = np.array([[0.0, 0.0, 1.0], [0.6, 0.8, 0.0], [0.0, 0.0, 0.0]])
+PLY = """ply
+format ascii 1.0
+element vertex 4
+property float x
+property float y
+property float z
+property float nx
+property float ny
+property float nz
+{}end_header
+0 0 0 0 0 1
+0.125 0 0 0.6 0.8 0
+0 0.25 0 0 0 0
+0.125 0 0 -1 0 0
+{}"""
+
+
+def test_normals_of_arrays_are_read_where_they_are_asked_for(tmp_path):
+    given = {
+        "surface": SURFACE,
+        "surface_normal": 1.005 * NORMALS,
+        "surface_step": np.array([1, 0, 0]),
+        "known": SURFACE + 1.0,
+        "known_sdf": np.array([0.0, 0.01, 0.0]),
+        "known_normal": NORMALS[::-1],
+        "known_normal_noise": np.array([0.0, 0.1, 0.2]),
+        "free": SURFACE + 2.0,
+    }
+    path = npz(tmp_path, **given)
+    session = PointsSource(PointsSettings(str(path), normals="file", normal_noise=0.4), BOX)
+    first, later = session.probes()
+    assert [warning.code for warning in session.warnings] == []
+    np.testing.assert_allclose(first.new_points.normals, [*NORMALS[1:], *NORMALS[::-1]])
+    np.testing.assert_array_equal(first.new_points.normal_noise, [0.4, 0.0, 0.0, 0.1, 0.2])
+    np.testing.assert_array_equal(first.contacts, [*SURFACE[1:], *SURFACE[[0, 2]] + 1.0])
+    np.testing.assert_allclose(first.contact_normals, [*NORMALS[1:], *NORMALS[[2, 0]]])
+    np.testing.assert_allclose(later.new_points.normals, NORMALS[:1])
+    unread = PointsSource(PointsSettings(str(path)), BOX)
+    (warning,) = unread.warnings
+    assert warning.code == "normals_unused"
+    assert str(warning).endswith("has normals, which are not used; session.normals=file uses them")
+    without = {name: array for name, array in given.items() if "normal" not in name}
+    plain = PointsSource(PointsSettings(str(npz(tmp_path, **without))), BOX)
+    digests = [[probe.new_points.digest for probe in source.probes()] for source in (unread, plain)]
+    assert digests[0] == digests[1]
+    assert plain.warnings == []
+
+
+def test_normals_of_rows_are_read_where_they_are_asked_for(tmp_path):
+    rows = "x,y,z,kind,sdf,nx,ny,nz,normal_noise\n0,0,0,surface,,0,0,1,0.1\n"
+    rows += "1,0,0,surface,,,,,\n2,0,0,free,,,,,\n3,0,0,known,0,0.6,.8,0,\n"
+    path = text(tmp_path, rows)
+    points = read_points(path, normal_noise=0.3).at(0)
+    np.testing.assert_allclose(points.normals, [[0, 0, 1], [0, 0, 0], [0.6, 0.8, 0]])
+    np.testing.assert_array_equal(points.normal_noise, [0.1, 0.0, 0.3])
+    unread = read_points(text(tmp_path, rows.replace(".8", "no number")))
+    assert unread.has_unread_normals
+    assert not unread.at(0).has_normals
+
+
+@pytest.mark.parametrize(
+    "face", [("", ""), ("element face 1\nproperty list uchar int vertex_indices\n", "3 0 1 2\n")]
+)
+def test_normals_of_ply_vertices_are_read_where_they_are_asked_for(tmp_path, face):
+    """Of a place that comes twice, the first counts."""
+    path = text(tmp_path, PLY.format(*face), name="points.ply")
+    points = read_points(path, normal_noise=0.3).at(0)
+    np.testing.assert_array_equal(points.known, [[0, 0, 0], [0.125, 0, 0], [0, 0.25, 0]])
+    np.testing.assert_allclose(points.normals, NORMALS, atol=1e-7)
+    np.testing.assert_array_equal(points.normal_noise, [0.3, 0.3, 0.0])
+    assert read_points(path).has_unread_normals
+    assert not read_points(path).at(0).has_normals
+    binary = trimesh.Trimesh(SURFACE, [[0, 1, 2]], vertex_normals=np.tile([0.0, 0.6, 0.8], (3, 1)))
+    binary.export(tmp_path / "binary.ply", vertex_normal=True)
+    found = read_points(tmp_path / "binary.ply", normal_noise=0.3).at(0)
+    np.testing.assert_allclose(found.normals, np.tile([0.0, 0.6, 0.8], (3, 1)), atol=1e-7)
+
+
+@pytest.mark.parametrize("suffix", ["npz", "csv", "ply", "off", "stl", "xyz"])
+def test_a_file_without_normals_is_an_error_where_they_are_asked_for(tmp_path, suffix):
+    path = tmp_path / f"points.{suffix}"
+    if suffix == "npz":
+        np.savez(path, surface=SURFACE)
+    elif suffix == "csv":
+        path.write_text("x,y,z,kind,nx,ny,nz\n0,0,0,surface,,,\n")
+    elif suffix == "xyz":
+        np.savetxt(path, SURFACE)
+    else:
+        trimesh.Trimesh(SURFACE, [[0, 1, 2]]).export(path)
+    with pytest.raises(PointsError, match=rf"points.{suffix}: it has no normals; accepted: sess"):
+        read_points(path, normal_noise=0.3)
+    assert not read_points(path).at(0).has_normals
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"surface_normal": NORMALS[:2]}, "surface_normal has 2 rows; accepted: one per point, 3"),
+        ({"surface_normal": 1.02 * NORMALS}, r"surface_normal\[0\] is 1.02 long"),
+        ({"surface_normal": NORMALS * np.nan}, r"surface_normal\[0\] is not finite"),
+        ({"surface_normal_noise": np.full(3, 0.1)}, "normal_noise has no surface_normal"),
+        (
+            {"surface_normal": NORMALS, "surface_normal_noise": np.full(3, 15.0)},
+            "normal_noise is 15; in degrees",
+        ),
+        ({"known_normal": NORMALS}, "known_normal has no known; accepted: both, or none"),
+        ({"free_normal": NORMALS}, "array 'free_normal' is unknown"),
+    ],
+)
+def test_malformed_arrays_of_normals_are_named(tmp_path, arrays, message):
+    with pytest.raises(PointsError, match=rf"points.npz: .*{message}"):
+        read_points(npz(tmp_path, surface=SURFACE, **arrays), normal_noise=0.3)
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("surface,0,0,1.02,", "row 2: nx, ny, nz is no unit vector"),
+        ("surface,0,,1,", "row 2: one of nx, ny, nz is missing"),
+        ("surface,0,inf,1,", "row 2: one of nx, ny, nz and normal_noise is not finite"),
+        ("surface,0,b,1,", "row 2: ny is 'b'; accepted: a number"),
+        ("free,0,0,1,", "row 2: a normal, but kind is none of surface, known"),
+        ("surface,0,0,1,15", "row 2: normal_noise is not above 0, up to pi, radians"),
+        ("surface,0,0,1,0", "row 2: normal_noise is not above 0, up to pi, radians"),
+    ],
+)
+def test_malformed_normals_of_rows_are_named(tmp_path, row, message):
+    rows = f"x,y,z,kind,nx,ny,nz,normal_noise\n0,0,0,surface,0,0,1,0.1\n1,0,0,{row}\n"
+    with pytest.raises(PointsError, match=f"points.csv: {message}"):
+        read_points(text(tmp_path, rows), normal_noise=0.3)
+    for columns in ("x,y,z,nx,ny", "x,y,z,normal_noise"):
+        shown = columns.replace(",", ", ")
+        with pytest.raises(PointsError, match=f"its columns are {shown}; accepted: x, y, z"):
+            read_points(text(tmp_path, f"{columns}\n"), normal_noise=0.3)
+
+
+def test_settings_of_normals_that_cannot_be_are_refused_and_defaults_not_recorded():
+    for wrong, message in (
+        ({"normals": "mesh"}, "normals is 'mesh'; accepted: none, file"),
+        ({"normal_noise": 15.0}, "normal_noise is 15; in degrees"),
+        ({"normal_noise": 0.0}, "normal_noise is 0.0"),
+    ):
+        with pytest.raises(SettingError, match=message):
+            PointsSettings("x", **wrong)
+    default = dataclasses.asdict(PointsSettings("x"))
+    assert "normals" not in without_defaults(default)
+    assert "normal_noise" not in without_defaults(default)
+    asked = dataclasses.asdict(PointsSettings("x", normals="file", normal_noise=0.1))
+    assert without_defaults(asked) == asked
 
 
 @pytest.mark.parametrize(
