@@ -9,10 +9,17 @@ from typing import Protocol
 
 import numpy as np
 
-from chsel.errors import PoseError, SettingError, require_between, require_positive
+from chsel.errors import (
+    PoseError,
+    SettingError,
+    require_between,
+    require_instance,
+    require_positive,
+)
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, ShapesShown, digest, frozen
 from chsel.problem.noise import FREEDOMS, PRIOR_CONTACTS, PRIOR_OUTLIERS
 from chsel.problem.points import KnownPoints, Workspace, require_parts
+from chsel.problem.pose_prior import PosePrior
 from chsel.problem.poses import check_rigid, inverse
 from chsel.problem.pushes import Pushes
 from chsel.problem.sdf_grid import COARSEST, FINEST, SdfGrid
@@ -33,6 +40,7 @@ class RegistrationProblem(ShapesShown):
         default_factory=lambda: np.zeros((0, 4, 4))
     )
     pushes: Pushes | None = None  # that may have moved the object; None: it stands still
+    prior: PosePrior | None = None  # on the pose before any push; None: nothing is known of it
 
     def __post_init__(self) -> None:
         require_parts(sdf=self.sdf, points=self.points, workspace=self.workspace)
@@ -48,12 +56,16 @@ class RegistrationProblem(ShapesShown):
             raise SettingError("there is no known point; accepted: at least one of any class")
         if self.pushes is not None:
             self.pushes.require_points(self.points)
+        if self.prior is not None:
+            accepted = "chsel.PosePrior(centre=, centre_noise=), or None"
+            require_instance("prior", self.prior, kind=PosePrior, accepted=accepted)
 
     @cached_property
     def digest(self) -> str:
         """Digest of the problem."""
         parts = [self.sdf.digest, self.points.digest, digest(self.initial_set, self.low_cost_set)]
         parts += [] if self.pushes is None else [self.pushes.digest]
+        parts += [] if self.prior is None else [self.prior.digest]
         numbers = np.array([*self.workspace.lower, *self.workspace.upper, self.free_resolution])
         key = np.array([self.key.seed, self.key.step], dtype=np.uint64)
         text = np.frombuffer("".join(parts).encode(), dtype=np.uint8)
@@ -62,12 +74,16 @@ class RegistrationProblem(ShapesShown):
     def carried(self, distance: float) -> RegistrationProblem:
         """Return the problem of an object that stands still where pushes have moved it to.
 
-        distance: of one push, metres. Its points have moved with it, and there are no pushes left.
+        distance: of one push, metres. Its points and its prior have moved with it, and there are no
+        pushes left.
         """
         if self.pushes is None:
             return self
         points = self.pushes.carried(self.points, distance, resolution=self.free_resolution)
-        return replace(self, points=points, pushes=None)
+        prior = self.prior
+        if prior is not None:
+            prior = prior.shifted(distance * self.pushes.directions.sum(axis=0))
+        return replace(self, points=points, pushes=None, prior=prior)
 
 
 @dataclass(frozen=True, eq=False)
