@@ -177,8 +177,8 @@ class McapRecorder(Recorder):
         values: dict[str, Any] = {name: len(getattr(self._points, name)) for name in POINT_CLASSES}
         values |= {f"new_{name}": len(getattr(new, name)) for name in POINT_CLASSES}
         values |= {"step": step, "new_digest": new.digest}
-        if new.has_normals:
-            values |= {"normals": new.normals, "normal_noise": new.normal_noise}
+        values["normals"] = new.normals if new.has_normals else None
+        values["normal_noise"] = new.normal_noise if new.has_normals else None
         self._record("/known_points", step, values=values)
 
     def _write_problem(self, event: ProblemPosed) -> None:
