@@ -19,7 +19,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from chsel.errors import PointsWarning, PoseError, SettingError, quoted, require_positive
+from chsel.errors import (
+    PointsWarning,
+    PoseError,
+    SettingError,
+    quoted,
+    require_instance,
+    require_positive,
+)
 from chsel.numerics.arrays import FloatArray, ShapesShown, digest, frozen
 from chsel.numerics.elementary import arctangents, exps, logs
 from chsel.problem.noise import WRONG
@@ -147,7 +154,7 @@ class PosePrior(ShapesShown):
     def digest(self) -> str:
         """Digest of all fields."""
         values = [getattr(self, field.name) for field in fields(self)]
-        return digest(*[np.array([] if each is None else each) for each in values])
+        return digest(*[np.atleast_1d([] if each is None else each) for each in values])
 
     @property
     def freedoms(self) -> int:
@@ -261,6 +268,12 @@ class PosePrior(ShapesShown):
         if self.object_from_world is not None:
             cost = cost - logs(np.minimum(self.mixture(pose, sdf), 1.0))[0]
         return bool(cost > SURE + 0.5 * self.freedoms)
+
+
+def require_prior(given: object) -> None:
+    """Raise SettingError unless this is a prior."""
+    accepted = "chsel.PosePrior(centre=, centre_noise=) and such, or None"
+    require_instance("prior", given, kind=PosePrior, accepted=accepted)
 
 
 def check_prior(problem: RegistrationProblem, hypotheses: Hypotheses) -> list[PointsWarning]:

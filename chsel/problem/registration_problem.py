@@ -13,13 +13,12 @@ from chsel.errors import (
     PoseError,
     SettingError,
     require_between,
-    require_instance,
     require_positive,
 )
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, ShapesShown, digest, frozen
 from chsel.problem.noise import FREEDOMS, PRIOR_CONTACTS, PRIOR_OUTLIERS
 from chsel.problem.points import KnownPoints, Workspace, require_parts
-from chsel.problem.pose_prior import PosePrior
+from chsel.problem.pose_prior import PosePrior, require_prior
 from chsel.problem.poses import check_rigid, inverse
 from chsel.problem.pushes import Pushes
 from chsel.problem.sdf_grid import COARSEST, FINEST, SdfGrid
@@ -57,8 +56,7 @@ class RegistrationProblem(ShapesShown):
         if self.pushes is not None:
             self.pushes.require_points(self.points)
         if self.prior is not None:
-            accepted = "chsel.PosePrior(centre=, centre_noise=), or None"
-            require_instance("prior", self.prior, kind=PosePrior, accepted=accepted)
+            require_prior(self.prior)
 
     @cached_property
     def digest(self) -> str:
