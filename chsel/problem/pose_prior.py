@@ -131,25 +131,6 @@ class PosePrior(ShapesShown):
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
 
-    @classmethod
-    def from_settings(cls, name: str, settings: Any) -> PosePrior:
-        """Return the prior of a mapping from fields to plain values, as files of settings have it.
-
-        name: of the mapping, in errors. Raises SettingError for anything else.
-        """
-        accepted = [field.name for field in fields(cls)]
-        if not isinstance(settings, Mapping):
-            given = quoted(settings)
-            raise SettingError(f"{name} is {given}; accepted: a mapping of {', '.join(accepted)}")
-        for field in settings:
-            if field not in accepted:
-                shown = f"{name}.{field} is not a setting"
-                raise SettingError(f"{shown}; accepted: {', '.join(accepted)}")
-        try:
-            return cls(**settings)
-        except (SettingError, PoseError) as error:
-            raise SettingError(f"{name}: {error}") from None
-
     @cached_property
     def digest(self) -> str:
         """Digest of all fields."""
@@ -268,6 +249,26 @@ class PosePrior(ShapesShown):
         if self.object_from_world is not None:
             cost = cost - logs(np.minimum(self.mixture(pose, sdf), 1.0))[0]
         return bool(cost > SURE + 0.5 * self.freedoms)
+
+
+def prior_from_settings(name: str, given: Any) -> PosePrior | None:
+    """Return the prior of a mapping from fields to plain values, as files of settings have it.
+
+    name: of the mapping, in errors. None: no prior. Raises SettingError for anything else.
+    """
+    if given is None:
+        return None
+    accepted = [field.name for field in fields(PosePrior)]
+    if not isinstance(given, Mapping):
+        shown = quoted(given)
+        raise SettingError(f"{name} is {shown}; accepted: a mapping of {', '.join(accepted)}")
+    for field in given:
+        if field not in accepted:
+            raise SettingError(f"{name}.{field} does not exist; accepted: {', '.join(accepted)}")
+    try:
+        return PosePrior(**given)
+    except (SettingError, PoseError) as error:
+        raise SettingError(f"{name}: {error}") from None
 
 
 def require_prior(given: object) -> None:

@@ -35,6 +35,7 @@ from chsel.problem.points import (
     workspace_around,
     world_points,
 )
+from chsel.problem.pose_prior import prior_from_settings
 from chsel.problem.poses import nearest_rigid
 from chsel.problem.sdf_grid import OBJECT_PADDING
 from chsel.problem.streams import LAST_STEP
@@ -59,8 +60,10 @@ class PointsSettings:
     object_padding: float = OBJECT_PADDING  # of the SDF grid, metres
     start_contacts: int = 0  # a registration needs so many contacts
     start_probe: int = 0  # and this index of the probe
+    prior: Any = None  # fields of `chsel.PosePrior`; None: nothing is known of the pose
 
     def __post_init__(self) -> None:
+        prior_from_settings("prior", self.prior)
         require_positive("free_resolution", self.free_resolution)
         if not self.path:
             raise SettingError("path is missing; pass session.path=FILE, a file of known points")
@@ -85,6 +88,7 @@ class PointsSource(ProbeSource):
         self.initial_points = KnownPoints()
         self.count = len(self._steps)
         self.start = Start(contacts=settings.start_contacts, step=settings.start_probe)
+        self.prior = prior_from_settings("session.prior", settings.prior)
         self.warnings: list[PointsWarning] = []
         self._points: list[KnownPoints] = []  # of each step
         every = KnownPoints()

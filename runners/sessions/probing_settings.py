@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar
 
+from chsel.problem.pose_prior import prior_from_settings
 from chsel.problem.settings import (
     CheckedSettings,
     Presets,
@@ -21,7 +22,8 @@ from runners.sessions.probing_hand import DescribedHand
 Length = Annotated[float, positive]  # m
 Force = Annotated[float, positive]  # N
 Count = Annotated[int, not_negative]
-_STANDING = (("moves", 0.0), ("expect_moves", None))  # an object that stands still
+# Settings of an object that stands still, and of whose pose nothing is known.
+_NOT_RECORDED = (("moves", 0.0), ("expect_moves", None), ("prior", None))
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,8 @@ class ProbingSettings(CheckedSettings):
     moves: Annotated[float, between(0.0, 0.1)] = 0.0
     # m: the largest distance per push that registration assumes; None: as `moves`.
     expect_moves: Annotated[float, between(0.0, 0.1)] | None = None
+    prior: Annotated[Any, prior_from_settings] = None
+    """Fields of `chsel.PosePrior`; None: nothing is known of the pose."""
 
     presets: ClassVar[Presets] = {
         "paper": {
@@ -81,7 +85,9 @@ def expected_moves(session: Mapping[str, Any]) -> float:
 def without_defaults(session: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings as they are recorded: some only where they are not the default."""
     defaults = {"faults": LEVELS[CLEAN], "hand": DescribedHand()}
-    session = {k: v for k, v in session.items() if (k, v) not in _STANDING}
+    session = {k: v for k, v in session.items() if (k, v) not in _NOT_RECORDED}
+    if isinstance(session.get("rig"), Mapping):
+        session["rig"] = {k: v for k, v in session["rig"].items() if (k, v) not in _NOT_RECORDED}
     return {
         key: value
         for key, value in session.items()

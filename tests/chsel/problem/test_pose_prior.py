@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 from chsel.errors import PoseError, SettingError
 from chsel.problem.noise import WRONG
 from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.pose_prior import PosePrior, centre_of, check_prior
+from chsel.problem.pose_prior import PosePrior, centre_of, check_prior, prior_from_settings
 from chsel.problem.poses import Poses, axis_angle, compose, inverse, rotation_vector
 from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
@@ -201,14 +201,15 @@ def test_the_digest_depends_on_every_field_and_survives_a_copy():
 
 
 def test_settings_make_a_prior_and_name_what_is_wrong():
-    prior = PosePrior.from_settings("session.prior", CONFIDENT)
+    assert prior_from_settings("session.prior", None) is None
+    prior = prior_from_settings("session.prior", CONFIDENT)
     assert prior.digest == PosePrior(**CONFIDENT).digest
-    with pytest.raises(SettingError, match=r"^session.prior.center is not a setting; accepted"):
-        PosePrior.from_settings("session.prior", {"center": [0, 0, 0]})
+    with pytest.raises(SettingError, match=r"^session.prior.center does not exist; accepted"):
+        prior_from_settings("session.prior", {"center": [0, 0, 0]})
     with pytest.raises(SettingError, match=r"^session.prior: the prior has centre without"):
-        PosePrior.from_settings("session.prior", {"centre": [0, 0, 0]})
+        prior_from_settings("session.prior", {"centre": [0, 0, 0]})
     with pytest.raises(SettingError, match=r"^session.prior is 3; accepted: a mapping"):
-        PosePrior.from_settings("session.prior", 3)
+        prior_from_settings("session.prior", 3)
 
 
 def problem_with(sdf, prior, pushes=None) -> RegistrationProblem:
