@@ -31,10 +31,10 @@ from chsel.problem.points import (
     same_place,
     workspace_around,
 )
-from chsel.problem.pose_prior import PosePrior, check_prior
+from chsel.problem.pose_prior import PosePrior
 from chsel.problem.poses import inverse
 from chsel.problem.pushes import Pushes
-from chsel.problem.registration_problem import Hypotheses, Observer
+from chsel.problem.registration_problem import Hypotheses, Observer, check_prior
 from chsel.problem.sdf_grid import SdfGrid, object_grid
 from chsel.problem.streams import StreamKey
 from chsel.problem.trust import check_trust

@@ -15,12 +15,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from chsel.errors import (
-    PointsWarning,
     PoseError,
     SettingError,
     quoted,
@@ -41,9 +40,6 @@ from chsel.problem.poses import (
 )
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.surface import has_surface, in_order, object_centre
-
-if TYPE_CHECKING:
-    from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 
 MOST_POSES = 200  # of another estimator: every energy looks at all of them
 SURE = 5.0  # nats beyond the mean cost of a right prior, above which the points contradict it
@@ -275,19 +271,6 @@ def require_prior(given: object) -> None:
     """Raise SettingError unless this is a prior."""
     accepted = "chsel.PosePrior(centre=, centre_noise=) and such, or None"
     require_instance("prior", given, kind=PosePrior, accepted=accepted)
-
-
-def check_prior(problem: RegistrationProblem, hypotheses: Hypotheses) -> list[PointsWarning]:
-    """Return a warning if the best hypothesis, which has to be finite, contradicts the prior."""
-    problem = problem.carried(hypotheses.push_distance)
-    prior, pose = problem.prior, Poses.of(hypotheses.object_from_world[:1])
-    if prior is None or not prior.is_contradicted(pose, problem.sdf):
-        return []
-    metres, radians = prior.offset(pose, problem.sdf)
-    parts = [] if metres is None else [f"{100.0 * metres:.1f} cm"]
-    parts += [] if radians is None else [f"{math.degrees(radians):.0f} degrees"]
-    text = f"the points contradict the prior: the best pose is {' and '.join(parts)} off it"
-    return [PointsWarning("prior", text)]
 
 
 def centre_of(sdf: SdfGrid) -> FloatArray:

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from chsel.errors import (
+    PointsWarning,
     PoseError,
     SettingError,
     require_between,
@@ -19,7 +20,7 @@ from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, ShapesShown, 
 from chsel.problem.noise import FREEDOMS, PRIOR_CONTACTS, PRIOR_OUTLIERS
 from chsel.problem.points import KnownPoints, Workspace, require_parts
 from chsel.problem.pose_prior import PosePrior, require_prior
-from chsel.problem.poses import check_rigid, inverse
+from chsel.problem.poses import Poses, check_rigid, inverse
 from chsel.problem.pushes import Pushes
 from chsel.problem.sdf_grid import COARSEST, FINEST, SdfGrid
 from chsel.problem.streams import StreamKey
@@ -237,6 +238,19 @@ class Hypotheses:
             self.elites,
             *([np.array([self.push_distance])] if self.push_distance else []),
         )
+
+
+def check_prior(problem: RegistrationProblem, hypotheses: Hypotheses) -> list[PointsWarning]:
+    """Return a warning if the best hypothesis, which has to be finite, contradicts the prior."""
+    problem = problem.carried(hypotheses.push_distance)
+    prior, pose = problem.prior, Poses.of(hypotheses.object_from_world[:1])
+    if prior is None or not prior.is_contradicted(pose, problem.sdf):
+        return []
+    metres, radians = prior.offset(pose, problem.sdf)
+    parts = [] if metres is None else [f"{100.0 * metres:.1f} cm"]
+    parts += [] if radians is None else [f"{math.degrees(radians):.0f} degrees"]
+    text = f"the points contradict the prior: the best pose is {' and '.join(parts)} off it"
+    return [PointsWarning("prior", text)]
 
 
 class Observer(Protocol):

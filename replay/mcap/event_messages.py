@@ -167,7 +167,7 @@ def _prior_from(values: Mapping[str, Any] | None) -> PosePrior | None:
         for name in ("centre_noise", "axis_noise")
     }
     try:
-        return PosePrior(**(values | noise))
+        return PosePrior(**{**values, **noise})
     except ChselError as error:
         raise RecordingError(f"its prior cannot be used: {error}") from None
 
