@@ -58,12 +58,11 @@ class PointsSettings:
     object_resolution: float | None = None
     """Spacing of the SDF grid, metres; None: by the object, see `ObjectModel.resolution`."""
     object_padding: float = OBJECT_PADDING  # of the SDF grid, metres
+    prior: Any = None  # fields of `chsel.PosePrior`; None: nothing is known of the pose
     start_contacts: int = 0  # a registration needs so many contacts
     start_probe: int = 0  # and this index of the probe
-    prior: Any = None  # fields of `chsel.PosePrior`; None: nothing is known of the pose
 
     def __post_init__(self) -> None:
-        prior_from_settings("prior", self.prior)
         require_positive("free_resolution", self.free_resolution)
         if not self.path:
             raise SettingError("path is missing; pass session.path=FILE, a file of known points")
@@ -71,6 +70,7 @@ class PointsSettings:
             raise SettingError(
                 f"workspace is {self.workspace}; accepted: [[x0, x1], [y0, y1], [z0, z1]]"
             )
+        prior_from_settings("prior", self.prior)
 
 
 class PointsSource(ProbeSource):
@@ -85,10 +85,10 @@ class PointsSource(ProbeSource):
         self._steps = np.unique(self._file.steps).tolist()
         self.free_resolution = settings.free_resolution
         self.world_from_object = self._file.world_from_object
+        self.prior = prior_from_settings("session.prior", settings.prior)
         self.initial_points = KnownPoints()
         self.count = len(self._steps)
         self.start = Start(contacts=settings.start_contacts, step=settings.start_probe)
-        self.prior = prior_from_settings("session.prior", settings.prior)
         self.warnings: list[PointsWarning] = []
         self._points: list[KnownPoints] = []  # of each step
         every = KnownPoints()

@@ -22,8 +22,7 @@ from runners.sessions.probing_hand import DescribedHand
 Length = Annotated[float, positive]  # m
 Force = Annotated[float, positive]  # N
 Count = Annotated[int, not_negative]
-# Settings of an object that stands still, and of whose pose nothing is known.
-_NOT_RECORDED = (("moves", 0.0), ("expect_moves", None), ("prior", None))
+_STANDING = (("moves", 0.0), ("expect_moves", None))  # an object that stands still
 
 
 @dataclass(frozen=True)
@@ -84,14 +83,22 @@ def expected_moves(session: Mapping[str, Any]) -> float:
 
 def without_defaults(session: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings as they are recorded: some only where they are not the default."""
+    session = _without_no_prior(session)
     defaults = {"faults": LEVELS[CLEAN], "hand": DescribedHand()}
-    session = {k: v for k, v in session.items() if (k, v) not in _NOT_RECORDED}
-    if isinstance(session.get("rig"), Mapping):
-        session["rig"] = {k: v for k, v in session["rig"].items() if (k, v) not in _NOT_RECORDED}
+    session = {k: v for k, v in session.items() if (k, v) not in _STANDING}
     return {
         key: value
         for key, value in session.items()
         if key not in defaults
         or not isinstance(value, Mapping)
         or build_settings(type(defaults[key]), value, where=f"session.{key}") != defaults[key]
+    }
+
+
+def _without_no_prior(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings without a prior that is None, in the settings of a rig, too."""
+    return {
+        key: _without_no_prior(value) if key == "rig" and isinstance(value, Mapping) else value
+        for key, value in settings.items()
+        if (key, value) != ("prior", None)
     }
