@@ -26,6 +26,7 @@ from .policies import build_policy as build_policy
 from .problem.mesh import load_mesh as load_mesh
 from .problem.points import KnownPoints as KnownPoints
 from .problem.points import Workspace as Workspace
+from .problem.pose_prior import PosePrior as PosePrior
 from .problem.pushes import Pushes as Pushes
 from .problem.registration_problem import ArchiveSnapshot as ArchiveSnapshot
 from .problem.registration_problem import Hypotheses as Hypotheses

@@ -31,9 +31,10 @@ from chsel.problem.points import (
     same_place,
     workspace_around,
 )
+from chsel.problem.pose_prior import PosePrior
 from chsel.problem.poses import inverse
 from chsel.problem.pushes import Pushes
-from chsel.problem.registration_problem import Hypotheses, Observer
+from chsel.problem.registration_problem import Hypotheses, Observer, check_prior
 from chsel.problem.sdf_grid import SdfGrid, object_grid
 from chsel.problem.streams import StreamKey
 from chsel.problem.trust import check_trust
@@ -62,6 +63,7 @@ def register(
     workspace: Workspace | None = None,
     initial_set: Any = None,
     pushes: Pushes | None = None,
+    prior: PosePrior | None = None,
     previous: Hypotheses | None = None,
     resolution: float | None = None,
     free_resolution: float = FREE_RESOLUTION,
@@ -85,6 +87,7 @@ def register(
     points padded by the object's diameter. initial_set (B, 4, 4): E_0 as object_from_world.
     pushes: that may have moved the object while points became known, counted as free, occupied and
     known, of which contacts come first; `anchored` finds where it is now.
+    prior: what is known of the pose beforehand, before any push; read by `anchored` and by trust.
     previous: the last result, when points were added since (CHSEL, Alg. 2). resolution: of the
     SDF grid of a mesh, metres; by default that of `SdfGrid.from_mesh`. The grid is kept for the
     next call with this mesh. free_resolution: voxel side of free space, metres; used by free_term
@@ -142,6 +145,7 @@ def register(
         key=StreamKey(seed, step),
         settings=solver.online,
         previous=previous,
+        prior=prior,
     )
     if initial_set is not None:
         problem = replace(problem, initial_set=initial_set)
@@ -154,7 +158,7 @@ def register(
     result = solver.register(problem, observer)
     trust = trust_by(solver, problem, hypotheses=result)
     if trust is not None:
-        _warn(check_trust(trust, noise_of(solver)))
+        _warn(check_trust(trust, noise_of(solver)) + check_prior(problem, result))
     return replace(result, trust=trust)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from chsel.next_probe.decision_problem import Actions, Decision, DecisionProblem, HandShape
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.pose_prior import PosePrior
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 
@@ -60,6 +61,8 @@ class SessionStarted:
     start: Start | None = None
     # Metres that a touch moves the object at most; None in recordings of earlier versions.
     moves: float | None = None
+    # On the pose before the first probe; None: nothing is known of it.
+    prior: PosePrior | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ import numpy as np
 from chsel.errors import SettingError, quoted
 from chsel.next_probe.decision_problem import Actions
 from chsel.problem.noise import LIMIT, noise_model
+from chsel.problem.pose_prior import PosePrior
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.trust import SENSOR_NOISE, pose_energies
@@ -51,12 +52,20 @@ class WhichObject:
 
         targets: meshes by name, or paths, whose stems are the names. record: a new file NAME.mcap;
         each object has its own, NAME_OBJECT.mcap. noise, given: the same for all, see
-        `chsel.Session`. Raises SettingError for fewer than two, or two of one name.
+        `chsel.Session`; a prior is of the objects' centres, or of one axis of all their frames.
+        Raises SettingError for fewer than two, two of one name, and a prior on a single object.
         """
         named = targets if isinstance(targets, Mapping) else {Path(t).stem: t for t in targets}
         if len(named) < max(len(targets), 2):
             shown = quoted(list(targets))
             raise SettingError(f"targets are {shown}; accepted: two or more, of different names")
+        prior = given.get("prior")
+        for part in ("point", "object_from_world"):
+            if isinstance(prior, PosePrior) and getattr(prior, part) is not None:
+                raise SettingError(
+                    f"prior has {part}, which is of one object; accepted: centre, without a point, "
+                    "or axis"
+                )
         self.sessions: dict[str, Session] = {}
         self._lock = threading.RLock()
         self.candidates: list[Candidate] = []

@@ -181,6 +181,7 @@ class RealCase:
             free_resolution=given.free_resolution,
             key=StreamKey(seed, 0),
             settings=method.online,
+            prior=given.prior,
         )
         begun = time.perf_counter()
         found = method.register(problem)

@@ -10,6 +10,7 @@ import numpy as np
 from chsel.errors import PoseError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.pose_prior import PosePrior
 from chsel.problem.poses import (
     axis_angle,
     compose,
@@ -112,11 +113,13 @@ def posed_problem(
     previous: Hypotheses | None = None,
     enlargement: int = 1,
     pushes: Pushes | None = None,
+    prior: PosePrior | None = None,
 ) -> RegistrationProblem:
     """Return the problem of a step: known points, with E_0 and E_l from the result before.
 
     free_resolution: side of free voxels, metres. previous: that result, None for a first problem.
     enlargement: times the hypotheses of the settings. pushes: that may have moved the object.
+    prior: on its pose before them.
     Raise PoseError if that result has no poses or some that are not finite, and SettingError if no
     point is known.
     """
@@ -141,4 +144,5 @@ def posed_problem(
         key=key,
         low_cost_set=low_cost_set,
         pushes=pushes,
+        prior=prior,
     )

@@ -189,6 +189,18 @@ def rotation_vector(vectors: FloatArray) -> FloatArray:
     return axis_angle(axis, angle)
 
 
+def rotation_vectors(rotation: FloatArray) -> FloatArray:
+    """Return rotation vectors (N, 3) of rotations (N, 3, 3), up to pi radians long.
+
+    The inverse of `rotation_vector`, as accurate at turns by nearly pi as at small ones.
+    """
+    quaternion = quaternions(rotation)
+    quaternion = np.where(quaternion[:, 3:] < 0.0, -quaternion, quaternion)
+    size = np.sqrt((quaternion[:, :3] ** 2).sum(axis=1))
+    angle = 2.0 * arctangents(size, quaternion[:, 3])
+    return quaternion[:, :3] * (angle / np.where(size > 0.0, size, 1.0))[:, None]
+
+
 def random_rotations(stream: np.random.Generator, count: int) -> FloatArray:
     """Return rotations (count, 3, 3), uniform on SO(3): normalised Gaussian quaternions."""
     drawn = normals(stream, (count, 4))  # w x y z

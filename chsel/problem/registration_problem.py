@@ -9,11 +9,18 @@ from typing import Protocol
 
 import numpy as np
 
-from chsel.errors import PoseError, SettingError, require_between, require_positive
+from chsel.errors import (
+    PointsWarning,
+    PoseError,
+    SettingError,
+    require_between,
+    require_positive,
+)
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, ShapesShown, digest, frozen
 from chsel.problem.noise import FREEDOMS, PRIOR_CONTACTS, PRIOR_OUTLIERS
 from chsel.problem.points import KnownPoints, Workspace, require_parts
-from chsel.problem.poses import check_rigid, inverse
+from chsel.problem.pose_prior import PosePrior, require_prior
+from chsel.problem.poses import Poses, check_rigid, inverse
 from chsel.problem.pushes import Pushes
 from chsel.problem.sdf_grid import COARSEST, FINEST, SdfGrid
 from chsel.problem.streams import StreamKey
@@ -33,6 +40,7 @@ class RegistrationProblem(ShapesShown):
         default_factory=lambda: np.zeros((0, 4, 4))
     )
     pushes: Pushes | None = None  # that may have moved the object; None: it stands still
+    prior: PosePrior | None = None  # on the pose before any push; None: nothing is known of it
 
     def __post_init__(self) -> None:
         require_parts(sdf=self.sdf, points=self.points, workspace=self.workspace)
@@ -48,12 +56,15 @@ class RegistrationProblem(ShapesShown):
             raise SettingError("there is no known point; accepted: at least one of any class")
         if self.pushes is not None:
             self.pushes.require_points(self.points)
+        if self.prior is not None:
+            require_prior(self.prior)
 
     @cached_property
     def digest(self) -> str:
         """Digest of the problem."""
         parts = [self.sdf.digest, self.points.digest, digest(self.initial_set, self.low_cost_set)]
         parts += [] if self.pushes is None else [self.pushes.digest]
+        parts += [] if self.prior is None else [self.prior.digest]
         numbers = np.array([*self.workspace.lower, *self.workspace.upper, self.free_resolution])
         key = np.array([self.key.seed, self.key.step], dtype=np.uint64)
         text = np.frombuffer("".join(parts).encode(), dtype=np.uint8)
@@ -62,12 +73,16 @@ class RegistrationProblem(ShapesShown):
     def carried(self, distance: float) -> RegistrationProblem:
         """Return the problem of an object that stands still where pushes have moved it to.
 
-        distance: of one push, metres. Its points have moved with it, and there are no pushes left.
+        distance: of one push, metres. Its points and its prior have moved with it, and there are no
+        pushes left.
         """
         if self.pushes is None:
             return self
         points = self.pushes.carried(self.points, distance, resolution=self.free_resolution)
-        return replace(self, points=points, pushes=None)
+        prior = self.prior
+        if prior is not None:
+            prior = prior.shifted(distance * self.pushes.directions.sum(axis=0))
+        return replace(self, points=points, pushes=None, prior=prior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,6 +238,19 @@ class Hypotheses:
             self.elites,
             *([np.array([self.push_distance])] if self.push_distance else []),
         )
+
+
+def check_prior(problem: RegistrationProblem, hypotheses: Hypotheses) -> list[PointsWarning]:
+    """Return a warning if the best hypothesis, which has to be finite, contradicts the prior."""
+    problem = problem.carried(hypotheses.push_distance)
+    prior, pose = problem.prior, Poses.of(hypotheses.object_from_world[:1])
+    if prior is None or not prior.is_contradicted(pose, problem.sdf):
+        return []
+    metres, radians = prior.offset(pose, problem.sdf)
+    parts = [] if metres is None else [f"{100.0 * metres:.1f} cm"]
+    parts += [] if radians is None else [f"{math.degrees(radians):.0f} degrees"]
+    text = f"the points contradict the prior: the best pose is {' and '.join(parts)} off it"
+    return [PointsWarning("prior", text)]
 
 
 class Observer(Protocol):

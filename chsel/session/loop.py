@@ -23,6 +23,7 @@ from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.policies.policy import Policy
 from chsel.problem.initial_sets import OnlineSettings, posed_problem
 from chsel.problem.points import POINT_CLASSES, KnownPoints, Workspace, require_parts
+from chsel.problem.pose_prior import PosePrior, require_prior
 from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
@@ -97,6 +98,7 @@ class Loop:
         previous: Hypotheses | None = None,
         start: Start | None = None,
         moves: float = 0.0,
+        prior: PosePrior | None = None,
     ) -> None:
         """Start a loop before its first probe.
 
@@ -104,11 +106,13 @@ class Loop:
         result before, `online` of a method. seed: of the random streams of all steps. points: known
         before the first probe. previous: a result that the first problem follows from. start: when
         steps register; by default all do. moves: metres that a touch moves the object at most; 0
-        if it stands still.
+        if it stands still. prior: on the object's pose before the first probe.
         Raises ChselError for parts of another kind.
         """
         points = KnownPoints() if points is None else points
         require_parts(sdf=sdf, workspace=workspace, points=points)
+        if prior is not None:
+            require_prior(prior)
         require_instance(
             "settings", settings, kind=OnlineSettings, accepted="method.online of a method"
         )
@@ -124,6 +128,7 @@ class Loop:
         self._seed = seed
         self._start = _AT_ONCE if start is None else start
         self._moves = moves
+        self._prior = prior
         self.state = LoopState(points=points, previous=previous)
 
     @classmethod
@@ -146,6 +151,7 @@ class Loop:
             points=started.initial_points,
             start=started.start,
             moves=started.moves or 0.0,
+            prior=started.prior,
         )
 
     def problems(self, probes: Iterable[Probe]) -> Iterator[RegistrationProblem]:
@@ -209,6 +215,7 @@ class Loop:
             previous=state.previous,
             enlargement=state.enlargement,
             pushes=self.pushes(self._moves) if self._moves > 0.0 else None,
+            prior=self._prior,
         )
         self.state = replace(state, phase=Phase.POSED, problem=problem)
         return problem

@@ -28,7 +28,7 @@ from chsel.plausible.symmetry import object_symmetry
 from chsel.policies.policy import Policy
 from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.points import check_contacts, check_points
-from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust, check_prior
 from chsel.problem.trust import check_trust
 from chsel.session.judging import noise_of, unexpected_push
 from chsel.session.loop import Loop
@@ -211,6 +211,7 @@ class Run:
         if trust is not None:
             self.trust = trust
             self.warn(check_trust(trust, noise_of(self.method)))
+            self.warn(check_prior(problem, self.answer))
         self.belief = self.registered.belief or self.belief
         return self.answer
 

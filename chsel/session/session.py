@@ -45,6 +45,7 @@ from chsel.problem.points import (
     check_workspace,
     require_parts,
 )
+from chsel.problem.pose_prior import PosePrior, require_prior
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.sdf_grid import COARSEST, FINEST, OBJECT_PADDING, object_grid
 from chsel.problem.streams import StreamKey
@@ -115,6 +116,7 @@ class Session:
         resolution: float | None = None,
         free_resolution: float = FREE_RESOLUTION,
         moves: float = 0.0,
+        prior: PosePrior | None = None,
         seed: int = 0,
         record: str | Path | Recorder | None = None,
         live: bool = False,
@@ -126,9 +128,10 @@ class Session:
         sensor, metres, for methods with such a setting. policy: of `next_probe`, a name or what
         `build_policy` gives. hand: that probes along the z axis of its frame, metres.
         workspace: where the object can be; by default it follows from the first points. moves:
-        metres that a touch moves the object at most, along the hand's way. seed: of
-        the random streams. record: a new file .mcap or .rrd, or a recorder of one's own. live: show
-        the session in the Rerun viewer.
+        metres that a touch moves the object at most, along the hand's way. prior: what is known of
+        the pose beforehand, read by `anchored` and by trust. seed: of the random streams. record: a
+        new file .mcap or .rrd, or a recorder of one's own. live: show the session in the Rerun
+        viewer.
         Raises ChselError for what cannot be used, and RecordingError if the file exists.
         """
         mesh, name = _mesh_of(target)
@@ -151,6 +154,8 @@ class Session:
         require_positive("free_resolution", free_resolution)
         require_between("free_resolution", free_resolution, low=FINEST, high=COARSEST)
         require_positive("moves", moves, zero=True)
+        if prior is not None:
+            require_prior(prior)
         grid = None
         if workspace is not None:
             require_parts(workspace=workspace)
@@ -188,6 +193,7 @@ class Session:
             initial_points=KnownPoints(),
             environment=environment,
             moves=float(moves),
+            prior=prior,
         )
         self.method = method
         self.intake = Intake(self.started, grid, moves=moves)

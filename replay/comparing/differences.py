@@ -220,11 +220,15 @@ def _stages(event: Event) -> dict[str, Content]:
     values = content(event)
     match event:
         case ProblemPosed():
-            pushes = {name: values[name] for name in values if name.startswith("pushes")}
+            pushes, prior = (
+                {name: values[name] for name in values if name.split(".")[0] == part}
+                for part in ("pushes", "prior")
+            )
             return {
                 "making E_0": {"E_0": values["initial_set"]},
                 "making E_l": {"E_l": values["low_cost_set"]},
                 "pushes": pushes,
+                "prior": prior,
             }
         case Traced():
             return {f"{event.stage}, iteration {event.iteration}": values}

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, get_args
 import numpy as np
 import zstandard
 
-from chsel.errors import RecordingError
+from chsel.errors import ChselError, RecordingError
 from chsel.events import (
     ActionsOffered,
     Decided,
@@ -36,6 +36,7 @@ from chsel.next_probe.decision_problem import (
 from chsel.numerics.arrays import digest
 from chsel.problem.mesh import mesh_digest
 from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.pose_prior import PosePrior
 from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import ArchiveSnapshot, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
@@ -110,6 +111,7 @@ def _session_values(event: SessionStarted) -> dict[str, Any]:
         "sdf_digest": event.sdf.digest,
         "start": _start_values(event.start),
         "moves": None if event.moves is None else np.array([event.moves]),
+        "prior": _prior_values(event.prior),
     }
 
 
@@ -125,6 +127,7 @@ def session_from(
         "sdf": sdf,
         "start": _start_from(values["start"]),
         "moves": None if values["moves"] is None else float(values["moves"][0]),
+        "prior": _prior_from(values["prior"]),
     }
     return SessionStarted(**shared_arguments(SessionStarted, values) | parts)
 
@@ -145,6 +148,30 @@ def _start_from(values: Mapping[str, Any] | None) -> Start | None:
     return Start(contacts=values["contacts"], step=values["step"], steps=steps)
 
 
+def _prior_values(prior: PosePrior | None) -> dict[str, Any] | None:
+    """Return the message `PosePrior`."""
+    if prior is None:
+        return None
+    values = shared_values("PosePrior", prior)
+    return {
+        name: np.array([each]) if isinstance(each, float) else each for name, each in values.items()
+    }
+
+
+def _prior_from(values: Mapping[str, Any] | None) -> PosePrior | None:
+    """Return the prior of a message `PosePrior`; raise RecordingError if it is none."""
+    if values is None:
+        return None
+    noise = {
+        name: None if values[name] is None else float(values[name][0])
+        for name in ("centre_noise", "axis_noise")
+    }
+    try:
+        return PosePrior(**{**values, **noise})
+    except ChselError as error:
+        raise RecordingError(f"its prior cannot be used: {error}") from None
+
+
 def config_from_json(text: str) -> dict[str, Any]:
     """Return the configuration of a session; raise RecordingError if it is no mapping in JSON."""
     try:
@@ -162,6 +189,7 @@ def _problem_values(event: ProblemPosed) -> dict[str, Any]:
     pushes = problem.pushes
     return shared_values("Problem", problem) | {
         "pushes": None if pushes is None else shared_values("Pushes", pushes),
+        "prior": _prior_values(problem.prior),
         "step": event.step,
         "workspace": problem.workspace.bounds,
         "key_seed": problem.key.seed,
@@ -198,6 +226,7 @@ class RecordedProblem:
             "sdf": sdf,
             "points": points,
             "pushes": None if values["pushes"] is None else Pushes(**values["pushes"]),
+            "prior": _prior_from(values["prior"]),
         }
         problem = RegistrationProblem(**shared_arguments(RegistrationProblem, values) | parts)
         check_digest(f"the problem of step {self.step}", problem.digest, recorded=values["digest"])

@@ -67,6 +67,18 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
     "Text": {"name": "string", "value": "string"},
     # When steps register; `steps`: of no others than these.
     "Start": {"contacts": "uint32", "step": "sint32", "steps": "i8[S]?"},
+    # Parts of a prior that are absent are not given.
+    "PosePrior": {
+        "centre": ("f8[3]?", finite),
+        "centre_noise": ("f8[1]?", finite),  # metres
+        "point": ("f8[3]?", finite),
+        "axis": ("f8[3]?", finite),
+        "along": ("f8[3]?", finite),
+        "axis_noise": ("f8[1]?", finite),  # radians
+        "object_from_world": ("f8[J,4,4]?", rigid),
+        "covariances": ("f8[J,6,6]?", finite),
+        "weights": ("f8[J]?", chances),
+    },
     "Session": {
         "format_version": "uint32",
         "runner": ("string", check_name),
@@ -84,6 +96,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "source": ("string", check_name),
         "start": "Start?",
         "moves": ("f8[1]?", finite),  # metres
+        "prior": "PosePrior?",
     },
     "Probe": {
         "step": "sint32",
@@ -119,6 +132,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "sdf_digest": "string",
         "digest": "string",
         "pushes": "Pushes?",
+        "prior": "PosePrior?",
     },
     "ArchiveSnapshot": {
         "step": "sint32",

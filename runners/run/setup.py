@@ -201,4 +201,5 @@ def session_started(
         environment=environment(),
         start=setup.start,
         moves=setup.moves,
+        prior=source.prior,
     )

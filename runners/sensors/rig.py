@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from chsel.errors import SettingError
 from chsel.numerics.arrays import frozen
 from chsel.problem.points import Workspace
+from chsel.problem.pose_prior import prior_from_settings
 from chsel.problem.settings import Check, CheckedSettings, not_negative, one_of, positive
 
 NO_NORMALS = "none"  # setting of a sensor whose normals are not used
@@ -297,6 +298,8 @@ class Rig(CheckedSettings):
     """m/s; a frame or a joint that moves faster has jumped: nothing is swept across."""
 
     max_turn: Annotated[float, positive] = 10.0  # rad/s, the same
+    prior: Annotated[Any, prior_from_settings] = None
+    """Fields of `chsel.PosePrior`, in the frame `world`; null: nothing is known of the pose."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -41,6 +41,7 @@ from chsel.problem.points import (
     workspace_around,
     world_points,
 )
+from chsel.problem.pose_prior import prior_from_settings
 from chsel.problem.poses import nearest_rigid
 from chsel.problem.sdf_grid import OBJECT_PADDING
 from chsel.problem.streams import LAST_STEP
@@ -65,6 +66,7 @@ class PointsSettings:
     object_resolution: float | None = None
     """Spacing of the SDF grid, metres; None: by the object, see `ObjectModel.resolution`."""
     object_padding: float = OBJECT_PADDING  # of the SDF grid, metres
+    prior: Any = None  # fields of `chsel.PosePrior`; None: nothing is known of the pose
     start_contacts: int = 0  # a registration needs so many contacts
     start_probe: int = 0  # and this index of the probe
     normals: str = "none"
@@ -85,6 +87,7 @@ class PointsSettings:
             raise SettingError(
                 f"workspace is {self.workspace}; accepted: [[x0, x1], [y0, y1], [z0, z1]]"
             )
+        prior_from_settings("prior", self.prior)
 
 
 class PointsSource(ProbeSource):
@@ -100,6 +103,7 @@ class PointsSource(ProbeSource):
         self._steps = np.unique(self._file.steps).tolist()
         self.free_resolution = settings.free_resolution
         self.world_from_object = self._file.world_from_object
+        self.prior = prior_from_settings("session.prior", settings.prior)
         self.initial_points = KnownPoints()
         self.count = len(self._steps)
         self.start = Start(contacts=settings.start_contacts, step=settings.start_probe)

@@ -21,6 +21,7 @@ from chsel.next_probe.action_lattice import (
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
+from chsel.problem.pose_prior import prior_from_settings
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.streams import Purpose, StreamKey, normals
@@ -163,6 +164,7 @@ class ProbingSource(Steerable):
         self.count = len(configuration.grid)
         self.start = Start(contacts=settings.start_contacts, step=settings.start_probe)
         self.push_distance = expected_moves(vars(settings))
+        self.prior = prior_from_settings("session.prior", settings.prior)
         self._seed = seed
         self._voxels = FreeVoxels(Lattice(self.workspace.lower, self.free_resolution))
         self.initial_points = KnownPoints(

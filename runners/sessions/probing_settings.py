@@ -6,7 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar
 
+<<<<<<< HEAD
 from chsel.problem.points import NORMAL_NOISE
+=======
+from chsel.problem.pose_prior import prior_from_settings
+>>>>>>> prior
 from chsel.problem.settings import (
     CheckedSettings,
     Presets,
@@ -73,6 +77,8 @@ class ProbingSettings(CheckedSettings):
     moves: Annotated[float, between(0.0, 0.1)] = 0.0
     # m: the largest distance per push that registration assumes; None: as `moves`.
     expect_moves: Annotated[float, between(0.0, 0.1)] | None = None
+    prior: Annotated[Any, prior_from_settings] = None
+    """Fields of `chsel.PosePrior`; None: nothing is known of the pose."""
 
     presets: ClassVar[Presets] = {
         "paper": {
@@ -93,6 +99,7 @@ def expected_moves(session: Mapping[str, Any]) -> float:
 
 def without_defaults(session: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings as they are recorded: some only where they are not the default."""
+    session = _without_no_prior(session)
     defaults = {"faults": LEVELS[CLEAN], "hand": DescribedHand()}
 <<<<<<< HEAD
     session = {k: v for k, v in session.items() if (k, v) not in _STANDING}
@@ -107,4 +114,13 @@ def without_defaults(session: Mapping[str, Any]) -> dict[str, Any]:
         if key not in defaults
         or not isinstance(value, Mapping)
         or build_settings(type(defaults[key]), value, where=f"session.{key}") != defaults[key]
+    }
+
+
+def _without_no_prior(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings without a prior that is None, in the settings of a rig, too."""
+    return {
+        key: _without_no_prior(value) if key == "rig" and isinstance(value, Mapping) else value
+        for key, value in settings.items()
+        if (key, value) != ("prior", None)
     }

@@ -64,6 +64,7 @@ class ProbedProblems:
             workspace=self._of.workspace,
             free_resolution=self._of.free_resolution,
             key=StreamKey(self._seed, step),
+            prior=self._of.prior,
         )
 
     def hypotheses(self, step: int) -> None:

@@ -60,6 +60,7 @@ class RecordedSource(Steerable):
         self.free_resolution = start.free_resolution
         self.world_from_object = start.world_from_object
         self.initial_points = start.initial_points
+        self.prior = start.prior
         self.count = len(self._probes)
         self._config: Mapping[str, Any] = start.config.get("session", {})
         self.push_distance = expected_moves(self._config) if start.moves is None else start.moves
@@ -152,6 +153,7 @@ class RecordedSource(Steerable):
             points=self.initial_points,
             start=self.start_of(steps),
             moves=self.push_distance,
+            prior=self.prior,
         )
 
     def start_of(self, steps: Collection[int] | None) -> Start:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from chsel.errors import SettingError
 from chsel.events import Logged, Probe, RigDescribed, Start
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, check_points
+from chsel.problem.pose_prior import PosePrior, prior_from_settings
 from chsel.problem.settings import CheckedSettings, not_negative, positive
 from replay.files import file_digest
 from runners.objects.loader import ObjectModel
@@ -59,6 +60,8 @@ class SensorsSettings(CheckedSettings):
     start_contacts: Annotated[int, not_negative] = 4  # a registration needs so many contacts
     start_probe: Annotated[int, not_negative] = 0  # and this index of the probe
     images: bool = True  # record the images, too
+    prior: Annotated[Any, prior_from_settings] = None
+    """Fields of `chsel.PosePrior`; None: as the rig says."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -67,6 +70,12 @@ class SensorsSettings(CheckedSettings):
                 "path is missing; pass session.path=LOG, an .mcap file, a rosbag2 folder, or the "
                 ".yaml of a depth image"
             )
+
+    @property
+    def pose_prior(self) -> PosePrior | None:
+        """Prior on the pose of the object; None: nothing is known of it."""
+        given = self.rig.prior if self.prior is None else self.prior
+        return prior_from_settings("session.prior", given)
 
 
 def open_sensors(  # noqa: PLR0917
@@ -105,6 +114,7 @@ class SensorsSource(ProbeSource):
         self.workspace = rig.box()
         self.free_resolution = settings.free_resolution
         self.start = Start(contacts=settings.start_contacts, step=settings.start_probe)
+        self.prior = settings.pose_prior
         self.world_from_object: FloatArray | None = None
         self._rig = rig
         self._diameter = diameter
@@ -214,6 +224,7 @@ class DepthFrameSource(ProbeSource):
         self.initial_points = KnownPoints()
         self.count = 1
         self.start = Start(contacts=settings.start_contacts, step=settings.start_probe)
+        self.prior = settings.pose_prior
         self._rig = settings.rig
         self._path = Path(settings.path or "").expanduser()
         self._images = settings.images

@@ -13,6 +13,7 @@ from chsel.next_probe.action_lattice import ActionSettings
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.pose_prior import PosePrior
 from runners.objects.loader import ObjectModel
 from runners.sensors.session_report import Report
 
@@ -43,6 +44,9 @@ class ProbeSource(Protocol):
 
     push_distance: float = 0.0
     """Largest distance in metres by which a push moves the object, as registration assumes."""
+
+    prior: PosePrior | None = None
+    """Prior on the pose of the object before the first probe; None: nothing is known of it."""
 
     warnings: Sequence[InputWarning] = ()
     """Warnings about the source, for the recording."""

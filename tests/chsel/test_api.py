@@ -125,6 +125,8 @@ NOISE = np.random.default_rng(0).normal(0.0, 0.004, SURFACE.shape)
 ANCHORED = {"method": "anchored", "settings": {"size": "small", "noise": 0.0001}}
 HALL = chsel.Workspace((-400, -400, -200), (400, 400, 200))
 STARTS = inverse(compose(POSE[None, :3, :3], 1000.0 * POSE[None, :3, 3]))
+ELSEWHERE = chsel.PosePrior(centre=POSE[:3, 3] + [0.1, 0.0, 0.0], centre_noise=0.01)
+NEARBY = chsel.PosePrior(centre=POSE[:3, 3] + [0.01, 0.0, 0.0], centre_noise=0.01)
 ASIDE = chsel.Workspace((0.38, 0, 0), (0.6, 0.3, 0.3))
 
 
@@ -142,12 +144,13 @@ ASIDE = chsel.Workspace((0.38, 0, 0), (0.6, 0.3, 0.3))
         ({"contacts": SURFACE, "initial_set": STARTS}, "far_away"),
         ({"contacts": 3.0 * SURFACE}, "no_fit"),
         ({"contacts": SURFACE + NOISE, **ANCHORED}, "above_noise"),
+        ({"contacts": SURFACE, "free": FREE, "prior": ELSEWHERE}, "prior"),
     ],
 )
 def test_points_that_are_hardly_meant_give_a_warning_and_good_ones_none(arguments, code):
     assert code in warned(**arguments)
     room = chsel.Workspace.around(SURFACE, 0.1)
-    assert warned(contacts=SURFACE, free=FREE, workspace=room) == []
+    assert warned(contacts=SURFACE, free=FREE, workspace=room, prior=NEARBY) == []
 
 
 def test_points_far_off_all_poses_give_one_warning():
@@ -182,6 +185,7 @@ def test_points_far_off_all_poses_give_one_warning():
         ({"initial_set": np.zeros((2, 4, 4))}, r"initial_set\[0\] is not a rigid"),
         ({"initial_set": np.zeros((0, 4, 4))}, "initial_set is empty"),
         ({"previous": np.eye(4)[None]}, "previous is .*; accepted: the Hypoth"),
+        ({"prior": {"centre": POINT[0]}}, r"prior is .*; accepted: chsel\.PosePrior"),
         ({"seed": 1.5}, r"seed is 1.5; accepted: an integer from 0 to 2\*\*64"),
         ({"hypotheses": 2.5}, "hypotheses is 2.5; accepted: an integer"),
         ({"workspace": [[0, 0, 0], [1, 1, 1]]}, r"workspace is \[\[0.*; accepted: chsel\.Workspa"),

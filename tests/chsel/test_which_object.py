@@ -48,6 +48,18 @@ def test_the_true_object_comes_first(tmp_path):
     assert read_recording(tmp_path / "again_slim.mcap").ended.outcome.startswith("failed")
 
 
+def test_a_prior_on_a_single_object_is_refused():
+    meshes = {"large": BOX, "small": BOX.copy().apply_scale(0.5)}
+    centre = {"centre": TRUTH[:3, 3], "centre_noise": 0.02}
+    poses = {"object_from_world": inverse(TRUTH)[None], "covariances": np.eye(6)}
+    for part, name in ((centre | {"point": [0.0, 0.0, 0.1]}, "point"), (poses, "object_from_wo")):
+        with pytest.raises(chsel.ChselError, match=f"^prior has {name}"):
+            chsel.WhichObject(meshes, prior=chsel.PosePrior(**part))
+    prior = chsel.PosePrior(**centre)
+    with chsel.WhichObject(meshes, prior=prior) as which:
+        assert [one.started.prior for one in which.sessions.values()] == [prior, prior]
+
+
 def test_what_one_object_cannot_have_is_added_to_none():
     """Contacts 21 m apart, which are never those of the smaller object: its diameter is 0.2 m."""
     small = BOX.copy()

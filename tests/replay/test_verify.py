@@ -10,6 +10,7 @@ import pytest
 
 from chsel import events
 from chsel.events import HypothesesFound, Measured, SessionStarted, Traced
+from chsel.problem.pose_prior import PosePrior
 from chsel.session.loop import Loop
 from replay.__main__ import main
 from replay.comparing.differences import is_close, ulps
@@ -22,6 +23,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 REPLAYS = REPOSITORY / "tests" / "replays"
 DESCENT = REPLAYS / "cracker_box_gradient_descent.mcap"
 CHSEL = REPLAYS / "points_mustard.mcap"
+OF_SESSION = Loop.of_session
 
 
 @pytest.fixture(scope="module")
@@ -156,6 +158,43 @@ def test_pushes_and_the_first_registration_are_computed_and_equal(pushing):
 def test_other_pushes_by_the_same_touches_differ(pushing, monkeypatch):
     monkeypatch.setattr(events, "_LEAST_SIDEWAYS", 2.0)  # no touch pushes
     assert outcomes(pushing) == [(1, DIFFERS, "pushes"), (2, DIFFERS, "pushes")]
+
+
+def test_a_prior_is_recorded_and_another_one_differs(write, monkeypatch):
+    prior = PosePrior(
+        centre=[0.1, 0.2, 0.3],
+        centre_noise=0.02,
+        axis=[1.0, 2.0, 3.0],
+        along=[0.3, -0.2, 0.1],
+        axis_noise=0.2,
+        object_from_world=[np.eye(4), np.eye(4)],
+        covariances=np.diag([1e-4, 2e-4, 3e-4, 0.01, 0.02, 0.03]),
+        weights=[0.3, 0.6],
+    )
+    path = write(pushing_session(prior=prior))
+    recording = read_recording(path)
+    assert recording.start.prior.digest == prior.digest
+    assert recording.problem(2).prior.digest == prior.digest
+    assert outcomes(path) == [(1, EQUAL, ""), (2, EQUAL, "")]
+    for other in (None, dataclasses.replace(prior, centre_noise=0.03)):
+        monkeypatch.setattr(Loop, "of_session", with_prior(other))
+        assert outcomes(path) == [(1, DIFFERS, "prior"), (2, DIFFERS, "prior")]
+
+
+def with_prior(prior):
+    """Return `Loop.of_session` for sessions with another prior."""
+
+    def other(started, *arguments, **named):
+        started = dataclasses.replace(started, prior=prior)
+        return OF_SESSION(started, *arguments, **named)
+
+    return other
+
+
+def test_a_prior_that_was_not_recorded_differs(pushing, monkeypatch):
+    prior = PosePrior(axis=[0.0, 0.0, 1.0], along=[0.0, 0.0, 1.0], axis_noise=0.1)
+    monkeypatch.setattr(Loop, "of_session", with_prior(prior))
+    assert outcomes(pushing) == [(1, DIFFERS, "prior"), (2, DIFFERS, "prior")]
 
 
 @pytest.mark.parametrize(

@@ -57,10 +57,10 @@ def steered_session(name="gradient_descent", *, policy="information", seed=3, **
     return _session(name, policy, seed=seed, changes=changes)
 
 
-def pushing_session(name="gradient_descent", *, seed=3):
+def pushing_session(name="gradient_descent", *, seed=3, **of_start):
     """Events of three touches that push a box, of which the last two register by themselves."""
     start = {"start": Start(contacts=6), "moves": 0.02}
-    return _session(name, None, seed=seed, probes=3, path=_SIDEWAYS, **start)
+    return _session(name, None, seed=seed, probes=3, path=_SIDEWAYS, **(start | of_start))
 
 
 def _session(name, policy_name, *, seed, changes=None, probes=2, path=None, **of_start):

@@ -117,6 +117,7 @@ OPENING = (
     ({"record": "touches.bag"}, "accepted: a name.mcap or name.rrd"),
     ({"workspace": chsel.Workspace((0, 0, 0), (90, 90, 90))}, "smaller workspace"),
     ({"hand": "hand.stl"}, "hand is 'hand.stl'; accepted: a mesh"),
+    ({"prior": "upright"}, r"prior is 'upright'; accepted: chsel\.PosePrior"),
 )
 MISTAKES = (
     ({}, "nothing was added"),
@@ -264,3 +265,20 @@ def test_a_failed_registration_is_an_error_and_the_next_one_goes_on(monkeypatch,
     assert {warning.filename for warning in caught} == {__file__}
     verdicts = verify(read_recording(tmp_path / "touches.mcap"))
     assert [each.outcome for each in verdicts] == ["no result", EQUAL]
+
+
+def test_a_session_records_its_prior_and_warns_where_points_contradict_it(tmp_path):
+    path = tmp_path / "touches.mcap"
+    prior = chsel.PosePrior(
+        centre=TRUTH[:3, 3] + [0.0, 0.12, 0.0], centre_noise=0.01, point=[0.0, 0.0, 0.0]
+    )
+    with chsel.Session(BOX, prior=prior, record=path) as session:
+        session.add(contacts=CONTACTS)
+        with pytest.warns(chsel.PointsWarning, match="12.0 cm off it"):
+            session.register()
+        assert [warning.code for warning in session.warnings] == ["prior"]
+        assert session.problem.prior is prior
+    recording = read_recording(path)
+    assert recording.start.prior.digest == prior.digest
+    assert recording.problem(0).digest == session.problem.digest
+    assert [verdict.outcome for verdict in verify(recording)] == [EQUAL]
