@@ -6,11 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar
 
-<<<<<<< HEAD
 from chsel.problem.points import NORMAL_NOISE
-=======
 from chsel.problem.pose_prior import prior_from_settings
->>>>>>> prior
 from chsel.problem.settings import (
     CheckedSettings,
     Presets,
@@ -26,18 +23,15 @@ from runners.sessions.probing_hand import DescribedHand
 Length = Annotated[float, positive]  # m
 Force = Annotated[float, positive]  # N
 Count = Annotated[int, not_negative]
-<<<<<<< HEAD
-_STANDING = (("moves", 0.0), ("expect_moves", None))  # an object that stands still
+_NOT_RECORDED = (
+    *(("moves", 0.0), ("expect_moves", None)),  # an object that stands still
+    *(("normals", "none"), ("normal_noise", NORMAL_NOISE)),  # of points in files
+)
 _NO_NORMALS = (  # of faults, which came later than others
     ("normals", None),
     ("normal_noise", 0.0),
     ("normal_wrong", 0.0),
     ("normal_tilt", 0.0),
-=======
-_NOT_RECORDED = (
-    *(("moves", 0.0), ("expect_moves", None)),  # an object that stands still
-    *(("normals", "none"), ("normal_noise", NORMAL_NOISE)),  # of points in files
->>>>>>> inputs
 )
 
 
@@ -101,13 +95,9 @@ def without_defaults(session: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings as they are recorded: some only where they are not the default."""
     session = _without_no_prior(session)
     defaults = {"faults": LEVELS[CLEAN], "hand": DescribedHand()}
-<<<<<<< HEAD
-    session = {k: v for k, v in session.items() if (k, v) not in _STANDING}
+    session = {k: v for k, v in session.items() if (k, v) not in _NOT_RECORDED}
     if isinstance(faults := session.get("faults"), Mapping):
         session["faults"] = {k: v for k, v in faults.items() if (k, v) not in _NO_NORMALS}
-=======
-    session = {k: v for k, v in session.items() if (k, v) not in _NOT_RECORDED}
->>>>>>> inputs
     return {
         key: value
         for key, value in session.items()
