@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from chsel.numerics.pose_tuples import moved, origin_within, pose_at, turned
 from chsel.numerics.threads import parallel_for
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, product, rotated, rotation_matrices
+from chsel.problem.prior_kernels import Prior, prior_energy, prior_of
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SE2Space, SE3Space, SearchSpace, origin_bounds
@@ -58,6 +59,7 @@ _FAR = np.float32(0.6)  # from an axis: more than 1 / sqrt(3), so that any direc
 _SHORTEST_SQUARED = np.float32(1e-9)  # of vectors that give a direction
 _OFF_NORMAL = 0.02  # metres that the normal of a contact costs which is across
 _MOST_OFF_NORMAL = 0.03  # and any other one, at most
+_PER_NAT = 0.005  # metres that a nat of the prior costs
 _GRADIENT = 127.0  # units of gradients of length 1 in a table of 8 bits
 _PER_GRADIENT = np.float32(1.0 / _GRADIENT)
 
@@ -89,7 +91,9 @@ def anchored_starts(
     """
     if not has_surface(problem.sdf):
         return Poses(np.zeros((0, 12)))
-    known = most_informative_first(problem.points)
+    points = replace(problem.points, normals=None, normal_noise=None)  # which CHSEL does not read
+    problem = replace(problem, points=points, prior=None)
+    known = most_informative_first(points)
     sampler = AnchorSampler(problem, known, space=space, settings=settings.anchors)
     return sampler.best(settings.samples, settings.kept, index=index)
 
@@ -313,6 +317,7 @@ class AnchorSampler:
             inside, costs = inside[:0], costs[:0]
         contacts = known.known[:_MOST_CONTACTS]
         by_normal = known.has_normals
+        prior = self._problem.prior
         costs = max(len(contacts), 1) / (max(len(costs), 1) * UNIT) * costs
         return CoarseScore(
             lower=self._lower,
@@ -331,6 +336,8 @@ class AnchorSampler:
                 np.where(known.normal_noise[:_MOST_CONTACTS] > 0.0, _OFF_NORMAL / UNIT, 0.0)
             ),
             most_off_normal=np.float32(_MOST_OFF_NORMAL / UNIT),
+            prior=prior_of(None if prior is None else prior.shifted(-self._middle), sdf),
+            per_nat=np.float32(_PER_NAT / UNIT),
             left_out=left_out,
             inside=_in_32_bits(inside),
             weights=np.rint(np.minimum(costs, _MOST_COST / max(len(costs), 1))).astype(np.int32),
@@ -473,6 +480,8 @@ class CoarseScore(NamedTuple):
     normals: Any  # (3, A), of contacts, world
     off_normal: Any  # (A,), UNITs that a normal costs which is across; 0 where there is none
     most_off_normal: Any  # UNITs that a normal costs at most
+    prior: Prior  # on poses around the middle
+    per_nat: Any  # UNITs that a nat of the prior costs
     left_out: int  # contacts that cost the most and do not count: 0 or 1
     inside: Any  # (P, 3), object frame
     weights: Any  # (P,), cost of each in free space, in UNITs of the sum over contacts
@@ -538,6 +547,7 @@ def _coarse_score(score, pose, nodes, beyond, limit):
             cost += _normal_cost(score, pose, n, nodes[n])
         total, worst = total + cost, max(worst, cost)
     total -= score.left_out * worst
+    total += np.int64(score.per_nat * prior_energy(score.prior, pose))
     voxels = score.voxels
     most = score.voxels.most
     inside = score.inside

@@ -425,7 +425,8 @@ def _moved(problem: RegistrationProblem, pose: Poses, *, twists: FloatArray) -> 
 def pose_energies(problem: RegistrationProblem, poses: Poses, *, noise: NoiseModel) -> FloatArray:
     """Return minus the log-likelihood (B,) of the points in poses, nats, see `chsel.problem.noise`.
 
-    Some of many points represent all; those left out count for nothing.
+    With a prior it is minus the log of the posterior density. Some of many points represent all;
+    those left out count for nothing.
     """
     points, sdf = problem.points, problem.sdf
     known = evenly_spaced(len(points.known), _MOST_KNOWN)
@@ -440,7 +441,8 @@ def pose_energies(problem: RegistrationProblem, poses: Poses, *, noise: NoiseMod
     normals = (
         posed_normals(sdf, points.with_known(known), poses=poses) if points.has_normals else None
     )
-    return noise.energies(residuals, np.concatenate(depths, axis=1), normals=normals)
+    energies = noise.energies(residuals, np.concatenate(depths, axis=1), normals=normals)
+    return energies if problem.prior is None else energies + problem.prior.energies(poses, sdf)
 
 
 def posed_normals(sdf: SdfGrid, points: KnownPoints, *, poses: Poses) -> PosedNormals:

@@ -21,6 +21,7 @@ from chsel.numerics.threads import parallel_for
 from chsel.problem.noise import EXTENT, SHARE, WRONG_NORMALS, NoiseModel
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses
+from chsel.problem.prior_kernels import Prior, prior_energy, prior_of
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_lookup import (
     cell_of,
@@ -55,10 +56,11 @@ class Likelihood(NamedTuple):
     power: float  # t
     softness: float  # metres
     wrong: float  # nats
+    prior: Prior  # on the pose, a further factor
 
 
-def likelihood_of(noise: NoiseModel, known: KnownPoints) -> Likelihood:
-    """Return tables for known points, in their order."""
+def likelihood_of(noise: NoiseModel, known: KnownPoints, *, prior: Prior) -> Likelihood:
+    """Return tables for known points, in their order, and a prior."""
     step = noise.sigmas[0] / _ROWS_PER_LEVEL
     rows = int(_BEYOND * noise.sigmas[-1] / step) + 2
     sizes = step * np.arange(rows, dtype=np.float64)
@@ -78,6 +80,7 @@ def likelihood_of(noise: NoiseModel, known: KnownPoints) -> Likelihood:
         power=noise.power(len(known.known)),
         softness=noise.softness,
         wrong=noise.wrong,
+        prior=prior,
     )
 
 
@@ -101,11 +104,12 @@ class Energy:
         self._cost = CompiledCost(problem.sdf, known, settings=settings, free_resolution=side)
         self._sdf = problem.sdf
         self._known = known
+        self._prior = prior_of(problem.prior, problem.sdf)
         self._set(noise)
 
     def _set(self, noise: NoiseModel) -> None:
         self.model: Model = self._cost.at_level(self._sdf, -noise.shared)
-        self.likelihood = likelihood_of(noise, self._known)
+        self.likelihood = likelihood_of(noise, self._known, prior=self._prior)
 
     def by(self, noise: NoiseModel) -> Energy:
         """Return the energy by another noise model."""
@@ -141,14 +145,16 @@ def energies_of(model, likelihood, poses, out, first, last, work):
 
 @leaf
 def known_energy(model, likelihood, pose, limit, levels):
-    """Return the energy of known points; infinite if it is surely above a limit.
+    """Return the energy of known points and of the prior; infinite if surely above a limit.
 
     levels (K,) become the posterior weights of the levels of noise.
     """
     known = model.known
     table, foreign, power = likelihood.densities, likelihood.foreign, likelihood.power
     count, size = known.shape[1], np.uint64(_LEVELS)
-    offset = 0.0
+    offset = prior_energy(likelihood.prior, pose)
+    if offset > limit:
+        return np.inf
     for k in range(size):
         levels[k] = 1.0
     for first in range(0, count, _AT_ONCE):
@@ -256,7 +262,7 @@ def depth_slope(likelihood, depth):
 
 @leaf
 def energy_below(model, likelihood, pose, known, limit, work):
-    """Return an energy of known points plus that of occupied and of gathered free ones.
+    """Return an energy of `known_energy` plus that of occupied and of gathered free points.
 
     It is infinite above a limit.
     """

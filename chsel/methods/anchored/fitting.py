@@ -31,6 +31,7 @@ from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import composed, moved, pose_at
 from chsel.numerics.threads import parallel_for
 from chsel.problem.poses import Poses
+from chsel.problem.prior_kernels import add_prior
 from chsel.problem.sdf_lookup import distance_between_nodes, distance_with_gradient
 from chsel.problem.search_space import SE2Space, SearchSpace
 
@@ -153,6 +154,7 @@ def _linearise(model, likelihood, twists, pose, fit):
     for i in range(7):
         for j in range(6):
             sums[i, j] = 0.0
+    add_prior(likelihood.prior, pose, twists.pivot, sums)
     for n in range(model.known.shape[1]):
         point = model.known[0, n], model.known[1, n], model.known[2, n]
         looked_up = distance_with_gradient(field, pose, point[0], point[1], point[2])

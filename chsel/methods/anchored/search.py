@@ -255,8 +255,11 @@ class Search:
         return AnchorSampler(self._problem, self._known, space=self._space, settings=anchors)
 
     def _previous(self) -> Poses:
-        """Return the best poses of E_0 and E_l."""
+        """Return the best poses of E_0 and E_l, and of another estimator in the prior."""
         sets = [self._problem.initial_set, self._problem.low_cost_set]
+        prior = self._problem.prior
+        if prior is not None and prior.object_from_world is not None:
+            sets.append(prior.object_from_world)
         poses = self._in_space(Poses.of(np.concatenate(sets)))
         return self.rated(poses).poses[: self._effort.previous]
 

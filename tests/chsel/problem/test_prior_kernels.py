@@ -5,11 +5,11 @@ import pytest
 import trimesh
 
 from chsel.methods.anchored.fitting import moved_about
-from chsel.methods.anchored.prior_kernels import add_prior, prior_energy, prior_of
 from chsel.numerics.compiler import compiled
 from chsel.numerics.pose_tuples import pose_at
 from chsel.problem.pose_prior import PosePrior
 from chsel.problem.poses import Poses, compose, inverse, rotation_vector
+from chsel.problem.prior_kernels import add_prior, prior_energy, prior_of
 from chsel.problem.sdf_grid import SdfGrid
 
 PIVOT = (0.02, -0.01, 0.03)
