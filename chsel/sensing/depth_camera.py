@@ -440,22 +440,31 @@ def _plane_normals(
 ) -> FloatArray:
     """Return normals (M, 3) of planes through used pixels of windows (K, M), 0 for a line."""
     weights = used / np.maximum(used.sum(axis=0), 1)
-    x, y, q = ((weights * each).sum(axis=0) for each in (right, down, inverse_depth))
-    across, along, values = right - x, down - y, inverse_depth - q
-    xx, yy, xy = (
-        (weights * each).sum(axis=0) for each in (across * across, along * along, across * along)
-    )
-    xq, yq = ((weights * each).sum(axis=0) for each in (across * values, along * values))
+
+    def mean(values: Any) -> FloatArray:
+        return np.asarray((weights * values).sum(axis=0))
+
+    x = mean(right)
+    y = mean(down)
+    q = mean(inverse_depth)
+    xx = mean((right - x) ** 2)
+    yy = mean((down - y) ** 2)
+    xy = mean((right - x) * (down - y))
+    xq = mean((right - x) * (inverse_depth - q))
+    yq = mean((down - y) * (inverse_depth - q))
     area = xx * yy - xy * xy
-    scale = 1.0 / np.where(area > _LEAST_AREA, area, np.inf)
-    per_column = (yy * xq - xy * yq) * scale
-    per_row = (xx * yq - xy * xq) * scale
-    row, column = pixels.T
-    at_centre = q - per_column * (x + column - camera.cx) - per_row * (y + row - camera.cy)
-    normals = -np.stack([camera.fx * per_column, camera.fy * per_row, at_centre], axis=1)
+    is_plane = area > _LEAST_AREA
+    area = np.where(is_plane, area, 1.0)
+    per_column = (yy * xq - xy * yq) / area
+    per_row = (xx * yq - xy * xq) / area
+    # Inverse depth is linear in rays (u, v, 1) with a normal's components as coefficients.
+    rows, columns = pixels.T
+    at_axis = q - per_column * (x + columns - camera.cx) - per_row * (y + rows - camera.cy)
+    normals = -np.stack([camera.fx * per_column, camera.fy * per_row, at_axis], axis=1)
     lengths = np.sqrt((normals**2).sum(axis=1))
-    scale = np.where(area > _LEAST_AREA, 1.0 / np.maximum(lengths, 1e-300), 0.0)
-    return normals * scale[:, None]
+    is_plane &= lengths > 0.0
+    lengths = np.where(is_plane, lengths, 1.0)
+    return np.where(is_plane[:, None], normals / lengths[:, None], 0.0)
 
 
 def one_per_voxel(points: FloatArray, side: float) -> FloatArray:
