@@ -91,7 +91,7 @@ def anchored_starts(
     """
     if not has_surface(problem.sdf):
         return Poses(np.zeros((0, 12)))
-    points = replace(problem.points, normals=None, normal_noise=None)  # which CHSEL does not read
+    points = problem.points.without_normals()  # as the method reads neither them nor a prior
     problem = replace(problem, points=points, prior=None)
     known = most_informative_first(points)
     sampler = AnchorSampler(problem, known, space=space, settings=settings.anchors)

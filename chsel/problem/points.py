@@ -147,6 +147,10 @@ class KnownPoints(ShapesShown):
         parts = {name: getattr(self, name)[which] for name in _OF_KNOWN}
         return replace(self, **parts)
 
+    def without_normals(self) -> KnownPoints:
+        """Return these points as if no normal were known."""
+        return KnownPoints(self.free, self.occupied, known=self.known, known_sdf=self.known_sdf)
+
     def merged(self, new: KnownPoints) -> KnownPoints:
         """Return these points followed by new ones, class by class."""
         return KnownPoints.joined([self, new])
