@@ -59,6 +59,8 @@ SURE_TURN = math.radians(10.0)  # that such a pose may be turned
 MOST_OUTLIERS = 0.3  # share
 MOST_MODES = 8  # sets of more are wide
 MOST_LEVELS = 10.0  # sensor noise levels that errors may have without a warning
+MOST_LEVELS_OF_MANY = 5.0  # the same, where MANY_BEYOND known points are more than a pose can fit
+MANY_BEYOND = 10
 LEAST_LEVELS = 3.0  # sensor noise levels that errors and widths may have on small objects
 NEAR_LIMIT = 1.5  # times LIMIT that moving a pose costs, below which the result says so
 LEAST_GAP = 2.0  # noise levels, as estimated, between modes
@@ -275,10 +277,11 @@ def check_trust(trust: Trust, sensor_noise: float = SENSOR_NOISE) -> list[Points
             "the object and its scale, and whether it moved"
         )
         return [PointsWarning("no_fit", text)]
-    if trust.misfit <= MOST_LEVELS:
+    most = MOST_LEVELS_OF_MANY if trust.redundancy >= MANY_BEYOND else MOST_LEVELS
+    if trust.misfit <= most:
         return []
     text = (
-        f"points are more than {MOST_LEVELS:g} noise levels off the best hypothesis on average, "
+        f"points are more than {most:g} noise levels off the best hypothesis on average, "
         f"see the trust in the result: the sensor is less exact than {sensor_noise:g} m, the "
         "object is not quite this one, or a better pose was not found"
     )

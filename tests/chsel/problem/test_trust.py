@@ -19,8 +19,10 @@ from chsel.problem.trust import (
     FOREIGN_CONTACT,
     LEAST_GAP,
     LEAST_LEVELS,
+    MANY_BEYOND,
     MANY_CONTACTS,
     MOST_LEVELS,
+    MOST_LEVELS_OF_MANY,
     MOST_MODES,
     MOST_NOISE,
     MOST_OFF,
@@ -113,8 +115,10 @@ def test_numbers_are_those_of_the_points_at_the_best_hypothesis():
     assert trust.noise == pytest.approx(0.002, rel=0.15)
     assert trust.misfit == pytest.approx(math.sqrt(2.0 / math.pi) * 2.0, rel=0.15)
     assert trust.outliers < 0.01
-    for misfit, codes in ((MOST_LEVELS, []), (1.001 * MOST_LEVELS, ["above_noise"])):
-        assert [each.code for each in check_trust(replace(trust, misfit=misfit))] == codes
+    for beyond, most in ((MANY_BEYOND - 1, MOST_LEVELS), (MANY_BEYOND, MOST_LEVELS_OF_MANY)):
+        for misfit, codes in ((most, []), (1.001 * most, ["above_noise"])):
+            judgement = replace(trust, misfit=misfit, redundancy=beyond)
+            assert [each.code for each in check_trust(judgement)] == codes
     upright = hypotheses(compose(np.eye(3), CENTRE))  # on its axes the grid is exact
     known = CENTRE[None] + np.array([RADIUS + 0.0005, 0.0, 0.0])
     one = judged(upright, NOISE, known=known, free=CENTRE[None] + 0.9)
