@@ -127,6 +127,9 @@ def trust_in(
     elif redundancy + len(points.free) + len(points.occupied) == 0:
         verdict = WIDE
         why = "no more contacts than a pose can fit"
+    elif error > most_error(redundancy, sensor_noise):
+        verdict = WIDE
+        why = f"errors far above the noise of {1000.0 * sensor_noise:g} mm that is stated"
     elif count > MOST_MODES:
         verdict = WIDE
         why = f"{count} groups of poses"
@@ -277,7 +280,7 @@ def check_trust(trust: Trust, sensor_noise: float = SENSOR_NOISE) -> list[Points
             "the object and its scale, and whether it moved"
         )
         return [PointsWarning("no_fit", text)]
-    most = MOST_LEVELS_OF_MANY if trust.redundancy >= MANY_BEYOND else MOST_LEVELS
+    most = most_error(trust.redundancy, sensor_noise) / sensor_noise
     if trust.misfit <= most:
         return []
     text = (
@@ -286,6 +289,14 @@ def check_trust(trust: Trust, sensor_noise: float = SENSOR_NOISE) -> list[Points
         "object is not quite this one, or a better pose was not found"
     )
     return [PointsWarning("above_noise", text)]
+
+
+def most_error(redundancy: int, sensor_noise: float) -> float:
+    """Return the mean error of points up to which a sensor's noise explains it, metres.
+
+    redundancy: known points beyond those that a pose can fit.
+    """
+    return sensor_noise * (MOST_LEVELS_OF_MANY if redundancy >= MANY_BEYOND else MOST_LEVELS)
 
 
 def correlation(points: FloatArray, errors: FloatArray) -> float:
