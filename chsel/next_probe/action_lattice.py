@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -19,6 +19,10 @@ FLOOR = 0.0  # height of the floor that the object lies on, metres
 CLEARANCE = 0.005  # metres: no part of the hand comes nearer to the floor
 MARGIN = 0.05  # metres: between the workspace and a hand that starts outside of it
 _SHORTEST = 0.01  # metres: of an action worth offering
+_WIDEST = 0.05  # metres: usual spacing
+_PER_DIAMETER = 0.15  # spacing by the diameter of an object for which that is too wide
+_USUAL = 200  # actions, at the widest spacing
+_DENSEST = 5.0  # times as many at most
 _COARSER = 1.02  # factor by which the spacing grows until there are few enough actions
 
 
@@ -37,9 +41,11 @@ class ActionSettings(CheckedSettings):
     # "configuration" the grid of the session itself, "forward" along its approach direction on a
     # lattice across the workspace, "around" from the sides and from above.
     choice: Annotated[str, one_of("configuration", "forward", "around")] = "around"
-    # Of the lattice, metres; it is coarser where more than `most` actions would result.
-    spacing: Annotated[float, positive] = 0.05
-    most: Annotated[int, positive, at_most(10_000)] = 200  # actions
+    # Of the lattice, metres; it is coarser where more than `most` actions would result. None: 15 %
+    # of the object's diameter, at most 0.05.
+    spacing: Annotated[float | None, positive] = None
+    # Actions; None: as many as cover the area that 200 cover 0.05 apart, at most 1000.
+    most: Annotated[int | None, positive, at_most(10_000)] = None
     # Where the hand can be; actions that begin outside of it are left out, and those that lead out
     # of it end there. None: everywhere.
     reach: ReachBall | None = None
@@ -47,6 +53,19 @@ class ActionSettings(CheckedSettings):
     # None: all actions count as equally long.
     speed: Annotated[float | None, positive] = None
     setup: Annotated[float, not_negative] = 1.0  # seconds that every probe takes besides
+
+    def for_object(self, diameter: float | None) -> ActionSettings:
+        """Return these settings with numbers for `spacing` and `most`.
+
+        diameter: of the object, metres; None if it is not known, and the spacing is the widest.
+        """
+        spacing = self.spacing
+        if spacing is None:
+            spacing = _WIDEST if diameter is None else min(_WIDEST, _PER_DIAMETER * diameter)
+        most = self.most
+        if most is None:
+            most = round(_USUAL * min(max(_WIDEST / spacing, 1.0) ** 2, _DENSEST))
+        return replace(self, spacing=spacing, most=most)
 
 
 def straight_actions(settings: ActionSettings, poses: FloatArray, *, length: FloatArray) -> Actions:
@@ -79,12 +98,15 @@ def forward_actions(
     rotation: FloatArray,
     start: float,
     length: float,
+    diameter: float | None = None,
 ) -> Actions:
     """Return a lattice across a workspace, all in one horizontal direction.
 
     rotation (3, 3): world_from_hand. start: of the hand's origin along that direction, metres in
-    the world. length: of every action, metres. Raises SettingError if none is left.
+    the world. length: of every action, metres. diameter: see `ActionSettings.for_object`. Raises
+    SettingError if none is left.
     """
+    settings = settings.for_object(diameter)
 
     def lattice(spacing: float) -> _Lattice:
         approach = _Approach(workspace, hand, rotation=rotation)
@@ -95,12 +117,20 @@ def forward_actions(
     return straight_actions(settings, starts, length=lengths)
 
 
-def around_actions(settings: ActionSettings, workspace: Workspace, *, hand: HandShape) -> Actions:
+def around_actions(
+    settings: ActionSettings,
+    workspace: Workspace,
+    *,
+    hand: HandShape,
+    diameter: float | None = None,
+) -> Actions:
     """Return lattices of actions that cross a workspace from outside, as far as the floor.
 
     From the four sides, and from above. Opposite sides are half a spacing apart, as what one of
-    them misses the other should meet. Raises SettingError if none is left.
+    them misses the other should meet. diameter: see `ActionSettings.for_object`. Raises
+    SettingError if none is left.
     """
+    settings = settings.for_object(diameter)
 
     def lattice(spacing: float) -> _Lattice:
         parts = []
@@ -214,6 +244,8 @@ def _few_enough(
     settings: ActionSettings, workspace: Workspace, *, lattice: Callable[[float], _Lattice]
 ) -> _Lattice:
     """Return the lattice at the spacing of the settings, or the next coarser one allowed."""
+    assert settings.spacing is not None
+    assert settings.most is not None
     sides = np.sort(np.ptp(workspace.bounds, axis=0))
     # With any less, one face alone has more.
     face = float(np.sqrt(sides[1] * sides[2] / (2.0 * settings.most)))

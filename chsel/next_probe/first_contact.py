@@ -10,10 +10,11 @@ import numpy as np
 from chsel.next_probe.decision_problem import Actions, HandShape, WeightedPoses
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, inner, leaf
-from chsel.numerics.pose_tuples import turned, turned_back
+from chsel.numerics.pose_tuples import pose_at, turned, turned_back
 from chsel.numerics.threads import parallel_for
 from chsel.problem.poses import Poses, rotated
 from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.sdf_lookup import distance_field, distance_with_gradient
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.subset import farthest_points
 from chsel.problem.surface import surface_points
@@ -22,6 +23,7 @@ POINTS = 800  # on the object's surface, evenly spread, among which a first cont
 _FINE_POINTS = 20_000  # on it as well, of which those around the best of the others decide
 _CANDIDATES = 5000  # of these, from which the others are taken
 _CELL = 0.005  # metres: of two points that a hand sees in one cell, the nearer counts
+_SHORTEST = 1e-12  # the least length that gradients are divided by
 _MOST_CELLS = 60  # along a side of what a hand sees: of a larger object cells are larger
 
 
@@ -30,6 +32,13 @@ class FirstContacts(NamedTuple):
 
     travel: FloatArray  # (K, A): way to the first contact, metres; inf where there is none
     contact: FloatArray  # (K, A, 3): that place on the object, world frame; 0 where there is none
+
+
+class ContactNormals(NamedTuple):
+    """Normals of the object at its first contacts, by A actions in K poses."""
+
+    normals: FloatArray  # (K, A, 3): unit vectors out of it, world frame; 0 where there is none
+    variances: FloatArray  # (K, A): of measured normals about each of two axes, radians^2
 
 
 class TouchedPoints(NamedTuple):
@@ -95,6 +104,25 @@ def first_contacts(
     return FirstContacts(travel, contact)
 
 
+def contact_normals(
+    sdf: SdfGrid, belief: WeightedPoses, *, first: FirstContacts, variance: float
+) -> ContactNormals:
+    """Return the normals at first contacts: directions of the gradient of the signed distance.
+
+    variance: of a normal that is measured on a flat face, about each of two axes, radians^2. Where
+    gradients cancel, as around an edge, the variance is larger by 1 less the gradient's length.
+    """
+    field = distance_field(sdf, "trilinear", outside="surface_point")
+    poses = np.array(Poses.of(belief.object_from_world).numbers)
+    found = ContactNormals(np.zeros(first.contact.shape), np.full(first.travel.shape, variance))
+
+    def run(begin: int, end: int, _: Any) -> None:
+        find_normals(field, poses, first, found, begin, end)
+
+    parallel_for(run, len(poses), scratch=lambda: None, least=50)
+    return found
+
+
 def touched_points(sdf: SdfGrid) -> TouchedPoints:
     """Return points on the object's surface that a hand can touch."""
 
@@ -136,6 +164,25 @@ def find_nearest(points: Any, others: Any, nearest: Any) -> None:
             squared = x * x + y * y + z * z
             if squared < least:
                 least, nearest[f] = squared, n
+
+
+@compiled
+def find_normals(field: Any, poses: Any, first: Any, found: Any, begin: Any, end: Any) -> None:
+    """Fill the rows of some poses (begin, end) in `found`, whose variances are of flat faces."""
+    for k in range(begin, end):
+        pose = pose_at(poses, k)
+        for a in range(first.travel.shape[1]):
+            if first.travel[k, a] == np.inf:
+                continue
+            x, y, z = first.contact[k, a, 0], first.contact[k, a, 1], first.contact[k, a, 2]
+            _, u, v, w = distance_with_gradient(field, pose, x, y, z)
+            length = np.sqrt(u * u + v * v + w * w)
+            found.variances[k, a] += max(1.0 - length, 0.0)
+            x, y, z = turned_back(pose, u, v, w)
+            per_length = 1.0 / max(length, _SHORTEST)
+            found.normals[k, a, 0] = per_length * x
+            found.normals[k, a, 1] = per_length * y
+            found.normals[k, a, 2] = per_length * z
 
 
 @compiled

@@ -10,11 +10,17 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from chsel.next_probe.decision_problem import Decision, DecisionProblem, WeightedPoses
-from chsel.next_probe.first_contact import FirstContacts, first_contacts
+from chsel.next_probe.first_contact import (
+    ContactNormals,
+    FirstContacts,
+    contact_normals,
+    first_contacts,
+)
 from chsel.numerics.arrays import BoolArray, FloatArray, evenly_spaced
-from chsel.numerics.compiler import compiled
+from chsel.numerics.compiler import compiled, leaf
 from chsel.numerics.elementary import exp, exps, log, logs
 from chsel.numerics.threads import parallel_for
+from chsel.problem.noise import FACET, WRONG_NORMALS
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import Poses, compose, inverse, random_rotations, rotated
 from chsel.problem.registration_problem import Hypotheses
@@ -38,6 +44,7 @@ _UNLIKE = 0.01  # overlap of a hit with a miss: a sensor may err
 _NONE_OF_THESE = 0.05  # weight of all that the belief leaves out
 _ANY_OUTCOME = 0.01  # chance of what happened if none of the poses is right
 _WRONG = 0.001  # likelihood of a hit where a pose forecasts a miss, and the other way round
+_NO_NORMALS = ContactNormals(np.zeros((0, 0, 3)), np.zeros((0, 0)))
 
 
 @dataclass(frozen=True)
@@ -130,6 +137,19 @@ class Forecast:
         of = self.problem
         return first_contacts(of.sdf, of.belief, actions=of.actions, hand=of.hand)
 
+    @cached_property
+    def normals(self) -> ContactNormals:
+        """The normals at the first contacts; empty if no known contact has a normal.
+
+        The noise of the next one is the median noise of those.
+        """
+        of = self.problem
+        if not of.points.has_normals:
+            return _NO_NORMALS
+        noise = of.points.normal_noise
+        variance = 0.5 * float(np.median(noise[noise > 0.0])) ** 2 + FACET**2
+        return contact_normals(of.sdf, of.belief, first=self.first, variance=variance)
+
     @property
     def hit(self) -> BoolArray:
         """Whether an action meets the object (K, A), by pose."""
@@ -166,10 +186,12 @@ class Forecast:
         weights = np.array(self.problem.belief.weights)
         distances = self.distances
         contacts = self.first  # before threads begin, which must not wait for each other
+        normals = self.normals
         size = len(weights)
 
         def run(first: int, last: int, scratch: Any) -> None:
-            overlap(contacts, weights, distances, self.noise, gains, scratch, (first, last))
+            some = (first, last)
+            overlap(contacts, normals, weights, distances, self.noise, gains, scratch, some)
 
         parallel_for(run, count, scratch=lambda: np.empty((4, size)), least=20)
         return gains
@@ -181,16 +203,25 @@ class Forecast:
 
 @compiled
 def overlap(
-    first: Any, weights: Any, distances: Any, noise: Any, gains: Any, scratch: Any, some: Any
+    first: Any,
+    normals: Any,
+    weights: Any,
+    distances: Any,
+    noise: Any,
+    gains: Any,
+    scratch: Any,
+    some: Any,
 ) -> None:
     """Fill `gains` of some actions (first, last) from how alike their outcomes are.
 
     Outcomes of two poses overlap by the Bhattacharyya coefficient of Gaussians around their
-    contacts, B = exp(-d^2 / 8 noise^2); by 1 if both miss, and hardly if one does. A pose survives
-    another's outcome with likelihood B^2. Information is the pairwise bound of Kolchinsky and
-    Tracey (Entropy, 2017), - sum_i w_i ln sum_j w_j B_ij.
+    contacts, B = exp(-d^2 / 8 noise^2), times that of their normals, if these are forecast; by 1 if
+    both miss, and hardly if one does. A pose survives another's outcome with likelihood B^2.
+    Information is the pairwise bound of Kolchinsky and Tracey (Entropy, 2017),
+    - sum_i w_i ln sum_j w_j B_ij.
     """
     count = len(weights)
+    with_normals = len(normals.variances) > 0
     scale = 1.0 / (8.0 * noise * noise)
     alike = scratch[0]
     alive = scratch[1]
@@ -216,6 +247,8 @@ def overlap(
                     if exponent > _FARTHEST:
                         continue
                     b = exp(-exponent)
+                    if with_normals:
+                        b *= _normals_overlap(normals, i, j, a)
                 g = b * b
                 alike[i] += weights[j] * b
                 alike[j] += weights[i] * b
@@ -240,6 +273,23 @@ def overlap(
         gains.expected_spread[a] = np.sqrt(left)
         gains.loss[a] = loss
         gains.surviving[a] = surviving
+
+
+@leaf
+def _normals_overlap(normals: Any, i: Any, j: Any, a: Any) -> Any:
+    """Return the overlap of the normals that poses i and j forecast of action a.
+
+        N = (1 - q) exp(-(1 - cos) / 2 (v_i + v_j)) + q
+
+    The first term is the Bhattacharyya coefficient of Gaussians of the mean of both variances v, at
+    an angle whose square is 2 (1 - cos). A share q of normals is wrong, in any direction, whatever
+    the pose; as it is part of both outcomes, N is a lower bound on the coefficient of the mixtures.
+    """
+    cosine = 0.0
+    for axis in range(3):
+        cosine += normals.normals[i, a, axis] * normals.normals[j, a, axis]
+    exponent = 0.5 * max(1.0 - cosine, 0.0) / (normals.variances[i, a] + normals.variances[j, a])
+    return (1.0 - WRONG_NORMALS) * exp(-exponent) + WRONG_NORMALS
 
 
 @dataclass(frozen=True)

@@ -415,12 +415,13 @@ class Session:
     def actions(self, settings: ActionSettings | None = None) -> Actions:
         """Return straight probes from four sides and from above, where z is up, the floor at 0.
 
-        settings: by default those of the policy.
+        settings: by default those of the policy, whose spacing follows the object's diameter.
         """
         hand = self._require_hand()
         self._require_workspace()
         settings = settings or self._policy.settings.actions
-        return around_actions(settings, self.started.workspace, hand=hand)
+        diameter = self.started.sdf.diameter
+        return around_actions(settings, self.started.workspace, hand=hand, diameter=diameter)
 
     @_locked
     def next_probe(

@@ -214,7 +214,9 @@ class ProbingSource(Steerable):
         """Return the probes that can be chosen from; see `Steerable`."""
         push = self.settings.push_steps * self.settings.step_length
         if settings.choice == "around":
-            offered = around_actions(settings, self.workspace, hand=self.hand)
+            offered = around_actions(
+                settings, self.workspace, hand=self.hand, diameter=self._diameter
+            )
         elif settings.choice == "forward":
             offered = forward_actions(
                 settings,
@@ -223,6 +225,7 @@ class ProbingSource(Steerable):
                 rotation=ROTATION,
                 start=X_REST,
                 length=push,
+                diameter=self._diameter,
             )
         else:
             starts = np.array([(X_REST, y, z) for y, z in self.configuration.grid])

@@ -103,8 +103,8 @@ def test_no_action_is_chosen_by_two_objects():
     with chsel.WhichObject(meshes, workspace=WORKSPACE, hand=finger) as which:
         which.add(contacts=contacts[:3])
         names = [one.name for one in which.register()]
-        every = which.sessions["box"].actions()
-        chosen = which.next_probe().action
+        every = which.sessions["box"].actions(chsel.ActionSettings(spacing=0.05, most=200))
+        chosen = which.next_probe(every).action
         one = chsel.Actions(every.world_from_hand[[chosen]], every.length[[chosen]])
         for contact, name, action in ((3, names[0], 0), (4, names[1], None)):
             which.add(contacts=contacts[contact : contact + 1])

@@ -15,6 +15,7 @@ from chsel.next_probe.action_lattice import (
 )
 from chsel.next_probe.decision_problem import HandShape
 from chsel.problem.points import Workspace
+from runners.objects.loader import MODELS, OBJECTS, load_model
 
 # A box of 4 x 10 x 12 cm, its origin 2 cm from its back.
 LOWER = np.array([-0.02, -0.05, -0.02])
@@ -127,3 +128,24 @@ def test_a_reach_or_workspace_without_any_action_is_an_error():
 def test_a_tiny_spacing_costs_no_more_than_what_is_offered():
     actions = around_actions(ActionSettings(spacing=1e-9, most=2_000), WORKSPACE, hand=HAND)
     assert 1_800 < len(actions) <= 2_000
+
+
+def test_of_a_small_object_actions_are_denser_up_to_1000():
+    table = Workspace((0.0, 0.0, 0.0), (0.3, 0.3, 0.3))
+    actions = around_actions(ActionSettings(), table, hand=HAND, diameter=0.2)
+    above = actions.world_from_hand[actions.world_from_hand[:, 2, 2] == -1.0, :2, 3]
+    for axis in above.T:
+        np.testing.assert_allclose(np.diff(np.unique(axis.round(9))), 0.15 * 0.2)
+    assert 200 < len(actions) <= 200 * (0.05 / 0.03) ** 2
+    assert 900 < len(around_actions(ActionSettings(), table, hand=HAND, diameter=0.02)) <= 1000
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_of_the_enlarged_objects_actions_are_50_mm_apart_and_at_most_200(name):
+    diameter = float(np.linalg.norm(load_model(name, OBJECTS[name].scale).extents))
+    usual = around_actions(ActionSettings(), WORKSPACE, hand=HAND, diameter=diameter)
+    stated = ActionSettings(spacing=0.05, most=200)
+    for other in (None, 0.1):
+        expected = around_actions(stated, WORKSPACE, hand=HAND, diameter=other)
+        assert usual.digest == expected.digest
+    assert around_actions(ActionSettings(), WORKSPACE, hand=HAND).digest == usual.digest

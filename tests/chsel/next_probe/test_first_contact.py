@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from chsel.next_probe.decision_problem import CELL, Actions, HandShape, WeightedPoses
-from chsel.next_probe.first_contact import first_contacts, touched_points
+from chsel.next_probe.first_contact import contact_normals, first_contacts, touched_points
 from chsel.problem.poses import apply, compose, inverse, random_rotations
 from chsel.problem.sdf_grid import SdfGrid
 from runners.objects.loader import load_model
@@ -165,3 +166,41 @@ def test_threads_and_other_actions_change_no_bit(threads):
     alone = first_contacts(ball(), belief, actions=actions, hand=box_hand())
     assert np.array_equal(alone.travel, found.travel)
     assert np.array_equal(alone.contact, found.contact)
+
+
+def test_normals_at_first_contacts_point_out_of_the_object_and_are_unsure_at_its_edges():
+    """A box is turned about its middle; a finger comes along two of the world's axes."""
+    sides = np.array([0.1, 0.08, 0.06])
+    sdf = SdfGrid.from_mesh(trimesh.creation.box(sides), 0.004)
+    turns = random_rotations(np.random.default_rng(2), 6)
+    belief = WeightedPoses(compose(turns, np.zeros((6, 3))), np.full(6, 1.0 / 6.0))
+    finger = HandShape.of(trimesh.creation.box(bounds=[[-0.004] * 2 + [-0.1], [0.004] * 2 + [0.0]]))
+    stream = np.random.default_rng(3)
+    ahead = np.repeat([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]], 40, axis=0)
+    beside = stream.uniform(-0.05, 0.05, (80, 3)) * (ahead == 0.0)
+    starts = np.array(
+        [facing(start, z) for start, z in zip(beside - 0.3 * ahead, ahead, strict=True)]
+    )
+    first = first_contacts(sdf, belief, actions=Actions(starts, np.full(80, 0.6)), hand=finger)
+    found = contact_normals(sdf, belief, first=first, variance=0.01)
+    met = np.isfinite(first.travel)
+    assert (found.normals[~met] == 0.0).all()
+    np.testing.assert_allclose((found.normals[met] ** 2).sum(axis=1), 1.0)
+    on_faces = at_edges = 0
+    for k, turn in enumerate(turns):
+        places = first.contact[k, met[k]] @ turn.T
+        to_face = 0.5 * sides - np.abs(places)
+        face = np.argmin(to_face, axis=1)
+        rows = np.arange(len(face))
+        expected = np.sign(places[rows, face])[:, None] * turn[face]
+        cosines = (found.normals[k, met[k]] * expected).sum(axis=1)
+        second = np.sort(to_face, axis=1)[:, 1]
+        flat = second > 0.01
+        edge = second < 0.001
+        np.testing.assert_allclose(cosines[flat], 1.0, atol=1e-6)
+        np.testing.assert_allclose(found.variances[k, met[k]][flat], 0.01, atol=1e-6)
+        assert (found.variances[k, met[k]][edge] > 0.05).all()
+        on_faces += flat.sum()
+        at_edges += edge.sum()
+    assert on_faces > 50
+    assert at_edges > 0

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from chsel.errors import PoseError, SettingError
 from chsel.next_probe.decision_problem import HandShape, WeightedPoses
@@ -17,12 +18,19 @@ from chsel.next_probe.forecast import (
 )
 from chsel.policies import POLICIES, build_policy
 from chsel.problem.points import KnownPoints
-from chsel.problem.poses import Poses
+from chsel.problem.poses import Poses, axis_angle, compose
 from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from tests.chsel.next_probe.decisions import RADIUS, WORKSPACE, along_x, at, ball, ball_problem
 
 NOISE = 0.005
+# Of three contacts, the two with a normal have a median noise of 0.2 radians.
+TOUCHED = KnownPoints(
+    known=np.ones((3, 3)),
+    normals=[[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]],
+    normal_noise=[0.1, 0.0, 0.3],
+)
 PLACES = [(0.0, 0.0), (0.06, 0.0), (-0.05, 0.03), (0.0, -0.1), (0.28, 0.28)]
 
 
@@ -110,9 +118,15 @@ def test_the_spread_is_the_root_mean_square_distance_of_surfaces():
     assert decision.expected_spread == pytest.approx([decision.spread])
 
 
+def normal_overlap(cosines, first, second):
+    """The share of normals that two outcomes have in common, by angles and variances."""
+    return 0.9 * np.exp(-0.5 * (1.0 - cosines) / (first + second)) + 0.1
+
+
+@pytest.mark.parametrize("points", [KnownPoints(), TOUCHED])
 @pytest.mark.parametrize(("seed", "count", "reach"), [(3, 10, 0.06), (0, 1, 0.0), (5, 25, 0.15)])
-def test_gains_are_those_of_the_formulas(seed, count, reach):
-    problem = some_problem(seed, count, reach=reach)
+def test_gains_are_those_of_the_formulas(seed, count, reach, points):
+    problem = replace(some_problem(seed, count, reach=reach), points=points)
     forecast = Forecast(problem, NOISE)
     weights = problem.belief.weights
     first = forecast.first
@@ -122,7 +136,16 @@ def test_gains_are_those_of_the_formulas(seed, count, reach):
     squared = ((first.contact[:, None] - first.contact[None]) ** 2).sum(axis=-1)  # (K, K, A)
     both = hit[:, None] & hit[None]
     neither = ~hit[:, None] & ~hit[None]
-    alike = np.where(both, np.exp(-squared / (8.0 * NOISE**2)), np.where(neither, 1.0, 0.01))
+    near = np.exp(-squared / (8.0 * NOISE**2))
+    if points.has_normals:
+        centres = Poses.of(problem.belief.object_from_world).origins
+        places = first.contact - centres[:, None]  # in the object's axes, as it is not turned
+        gradients = problem.sdf.at(places.reshape(-1, 3), lookup="trilinear")[1]
+        lengths = np.sqrt((gradients**2).sum(axis=1))
+        units = (gradients / lengths[:, None]).reshape(places.shape)
+        spread = (0.5 * 0.2**2 + 0.05**2 + 1.0 - lengths).reshape(hit.shape)
+        near *= normal_overlap(np.einsum("iac,jac->ija", units, units), spread[:, None], spread)
+    alike = np.where(both, near, np.where(neither, 1.0, 0.01))
     with np.errstate(divide="ignore"):
         inner = np.log(np.einsum("j,ija->ia", weights, alike))
     expected = -np.einsum("i,ia->a", weights, np.where(weights[:, None] > 0.0, inner, 0.0))
@@ -185,3 +208,23 @@ def test_what_is_no_problem_is_refused(make, error, message):
         make()
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_only_normals_tell_poses_apart_that_are_turned_about_the_contact():
+    """A finger of 8 mm meets the middle of a box's face in both poses; one is turned by 0.6."""
+    angle = 0.6
+    sdf = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.1, 0.1)), 0.005)
+    place = np.array([-0.05, 0.0, 0.0])  # of the contact on the object
+    turns = axis_angle(np.tile([0.0, 0.0, 1.0], (2, 1)), np.array([0.0, angle]))
+    finger = HandShape.of(trimesh.creation.box(bounds=[[-0.004] * 2 + [-0.1], [0.004] * 2 + [0.0]]))
+    base = ball_problem(compose(turns, np.tile(place, (2, 1))), along_x([(0.0, 0.0)]))
+    information = []
+    for points in (KnownPoints(), TOUCHED):
+        forecast = Forecast(replace(base, sdf=sdf, hand=finger, points=points), 0.02)
+        assert forecast.hit.all()
+        np.testing.assert_allclose(forecast.first.contact, 0.0, atol=0.006)
+        information.append(float(build_policy("information").rate(forecast.problem, forecast)[0]))
+    shared = normal_overlap(math.cos(angle), 0.0225, 0.0225)  # 0.2^2 / 2 + 0.05^2
+    assert information[0] < 0.02
+    assert information[1] == pytest.approx(-math.log(0.5 + 0.5 * shared), abs=0.05)
+    assert information[1] > 0.3

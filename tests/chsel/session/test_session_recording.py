@@ -145,10 +145,14 @@ def test_actions_are_as_many_and_as_dense_as_is_asked_and_a_probe_is_as_long_as_
     ) as session:
         assert 10 < len(session.actions()) <= 30
         assert 5 <= len(session.actions(ActionSettings(most=10))) <= 10
-        dense = session.actions(ActionSettings(spacing=0.04, most=500))
-        places = dense.world_from_hand[dense.world_from_hand[:, 2, 2] == -1.0, :2, 3]  # from above
-        steps = [np.diff(np.unique(axis.round(9))) for axis in places.T]
-        np.testing.assert_allclose(np.concatenate(steps), 0.04)
+        diameter = np.sqrt((SIDES**2).sum())  # that of the grid is up to two nodes larger
+        for spacing, expected in ((0.04, 0.04), (None, 0.15 * diameter)):
+            dense = session.actions(ActionSettings(spacing=spacing, most=1000))
+            poses = dense.world_from_hand
+            places = poses[poses[:, 2, 2] == -1.0, :2, 3]  # from above
+            steps = np.concatenate([np.diff(np.unique(axis.round(9))) for axis in places.T])
+            np.testing.assert_allclose(steps, steps[0], rtol=1e-6)
+            np.testing.assert_allclose(steps[0], expected, rtol=0.1 if spacing is None else 1e-6)
         usual = session.actions()
         lengths = np.linspace(0.1, 0.2, len(usual))
         offered = chsel.Actions(usual.world_from_hand, lengths)

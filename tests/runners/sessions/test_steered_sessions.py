@@ -85,6 +85,16 @@ def test_an_action_is_taken_once(session):
         next(iter(session.take(1, len(actions))))
 
 
+@pytest.mark.parametrize("choice", ["around", "forward"])
+def test_of_an_object_of_real_size_more_actions_are_offered(choice):
+    mesh = load_model("mustard")  # of 0.225 m
+    session = open_probing(
+        "kinematic", mesh, configuration_name="mustard", settings=ProbingSettings(), seed=0
+    )
+    assert 200 < len(session.offer(ActionSettings(choice=choice))) <= 440
+    assert len(session.offer(ActionSettings(choice=choice, spacing=0.05))) <= 200
+
+
 def test_the_grid_as_actions_has_the_outcomes_of_the_grid():
     paper = open_probing(
         "kinematic", _mustard(), configuration_name="mustard", settings=ProbingSettings(), seed=0
