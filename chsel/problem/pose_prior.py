@@ -147,7 +147,7 @@ class PosePrior(ShapesShown):
 
     def energies(self, poses: Poses, sdf: SdfGrid) -> FloatArray:
         """Return E (B,) of poses, nats: the same bits on every machine. sdf: of the object."""
-        wrong = math.exp(-WRONG)
+        wrong = exps(-WRONG)
         right = (1.0 - wrong) * exps(-self.quadratic_costs(poses, sdf))
         if self.object_from_world is not None:
             right = right * np.minimum(self.mixture(poses, sdf), 1.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import triple
 from chsel.numerics.compiler import inner, leaf
-from chsel.numerics.elementary import arctangent, exp, log, sine_cosine
+from chsel.numerics.elementary import arctangent, exp, exps, log, sine_cosine
 from chsel.numerics.pose_tuples import moved, pose_at, turned, turned_back
 from chsel.problem.noise import WRONG
 from chsel.problem.pose_prior import PosePrior, centre_of
@@ -53,7 +52,7 @@ def prior_of(prior: PosePrior | None, sdf: SdfGrid) -> Prior:
         whitening=np.zeros((0, 6, 6)),
         densities=np.zeros(0),
         middle=(0.0, 0.0, 0.0),
-        wrong=math.exp(-WRONG),
+        wrong=float(exps(-WRONG)),
     )
     if prior is None:
         return values

@@ -290,10 +290,13 @@ class Loop:
     ) -> WeightedPoses:
         """Return the poses that a decision weighs, by a result, by default the last one.
 
-        Raise SettingError before any result if the floor is above the workspace.
+        Free space alone lets a result be anywhere else, so before a point on the object is known
+        there are poses all over the workspace. Raise SettingError then if the floor is above it.
         """
         hypotheses = self.state.previous if hypotheses is None else hypotheses
-        if hypotheses is not None and len(hypotheses.cost) > 0:
+        points = self.state.points
+        on_object = len(points.known) + len(points.occupied) > 0
+        if hypotheses is not None and len(hypotheses.cost) > 0 and on_object:
             return belief_after(hypotheses, settings)
         top = self.workspace.upper[2]
         if settings.floor is not None and settings.floor > top:
