@@ -221,6 +221,21 @@ def test_what_is_no_decision_is_refused(changes, message):
         steered(Somebody(**changes)).decide(available)
 
 
+def test_before_a_point_on_the_object_a_decision_weighs_poses_all_over_the_workspace():
+    """A result by free space alone, of a single pose far away, is not what it weighs."""
+    policy = build_policy("information")
+    far = hypotheses_at(np.array([[[1, 0, 0, 9.0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]]))
+    loop = loop_of(policy=policy, points=KnownPoints(free=[[0.4, 0.0, 0.5]]))
+    before = loop.belief(policy.settings.belief)
+    loop.remember(far)
+    assert loop.belief(policy.settings.belief).digest == before.digest
+    assert len(before) > 20
+    loop.perceive(touch(0, KnownPoints(known=[[0.1, 0.0, 0.1]]), contacts=[0.1, 0.0, 0.1]))
+    np.testing.assert_array_equal(
+        loop.belief(policy.settings.belief).object_from_world, far.object_from_world
+    )
+
+
 def test_a_floor_above_the_workspace_is_an_error():
     loop = steered(build_policy("grid", {"belief": {"floor": 7.0}}))
     with pytest.raises(
