@@ -12,6 +12,7 @@ import numpy as np
 
 from chsel.errors import PointsWarning, PoseError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, evenly_spaced
+from chsel.numerics.elementary import logs
 from chsel.problem.noise import (
     FOREIGN,
     FREEDOMS,
@@ -50,10 +51,16 @@ DETERMINED, SEVERAL, WIDE, NOTHING = VERDICTS
 MOST_OFF = 0.04  # average error of points
 MOST_SYSTEMATIC = 0.012  # the same, if errors of neighbours are alike
 MOST_WIDTH = 0.03  # spread of a mode, and distance from a pose to the next one of its mode
+SURE_SHARE = 0.05  # what a pose that is determined may be off, if that is less than SURE_WITHIN
+
+SURE_WITHIN = 0.01  # metres that the centre of a pose that is determined may be off
+SURE_TURN = math.radians(10.0)  # that such a pose may be turned
 
 MOST_OUTLIERS = 0.3  # share
 MOST_MODES = 8  # sets of more are wide
 MOST_LEVELS = 10.0  # sensor noise levels that errors may have without a warning
+MOST_LEVELS_OF_MANY = 5.0  # the same, where MANY_BEYOND known points are more than a pose can fit
+MANY_BEYOND = 10
 LEAST_LEVELS = 3.0  # sensor noise levels that errors and widths may have on small objects
 NEAR_LIMIT = 1.5  # times LIMIT that moving a pose costs, below which the result says so
 LEAST_GAP = 2.0  # noise levels, as estimated, between modes
@@ -120,6 +127,9 @@ def trust_in(
     elif redundancy + len(points.free) + len(points.occupied) == 0:
         verdict = WIDE
         why = "no more contacts than a pose can fit"
+    elif error > most_error(redundancy, sensor_noise):
+        verdict = WIDE
+        why = f"errors far above the noise of {1000.0 * sensor_noise:g} mm that is stated"
     elif count > MOST_MODES:
         verdict = WIDE
         why = f"{count} groups of poses"
@@ -127,12 +137,13 @@ def trust_in(
         verdict = WIDE
     else:
         bests = [poses[part[:1]] for part in parts]
+        way = sure_within(sdf, sensor_noise)
         cost = min(
-            motion_cost(problem, pose, sensor_noise=sensor_noise, distance=width) for pose in bests
+            motion_cost(problem, pose, sensor_noise=sensor_noise, distance=way) for pose in bests
         )
         if cost <= NEAR_LIMIT * LIMIT:
             least = max(cost, 0.0)
-            why = f"moving it {1000.0 * width:.1f} mm costs {least:.1f} nats, wide up to {LIMIT:g}"
+            why = f"moving it {1000.0 * way:.1f} mm costs {least:.1f} nats, wide up to {LIMIT:g}"
         verdict = WIDE if cost <= LIMIT else DETERMINED if count == 1 else SEVERAL
     if verdict in (NOTHING, WIDE):
         count = 0  # groups of such poses are no modes
@@ -170,13 +181,28 @@ def explaining(
     if rivals is not None:
         poses = Poses.joined([poses, rivals])
         indices = np.concatenate([indices, np.full(len(rivals), -1)])
-    energies = pose_energies(problem, poses, noise=noise_model(sensor_noise))
+    noise = noise_model(sensor_noise)
+    energies = pose_energies(problem, poses, noise=noise)
     allowed = np.full(len(poses), energies.min() + LIMIT)
     if len(problem.points.known) < MANY_CONTACTS:
-        allowed[count:] += FOREIGN_CONTACT
+        allowed[count:] += FOREIGN_CONTACT + _normal_cost(problem.points, noise)
     likely = energies <= allowed
     likely[0] = True
     return poses[likely], indices[likely]
+
+
+def _normal_cost(points: KnownPoints, noise: NoiseModel) -> float:
+    """Return what it costs more to leave out a contact with a normal than one without, nats."""
+    if not points.has_normals:
+        return 0.0
+    variances = noise.normal_variances(points.normal_noise)
+    ratios = noise.greatest(variances) / noise.greatest(np.zeros(len(variances)))
+    return float(logs(ratios).max())
+
+
+def sure_within(sdf: SdfGrid, sensor_noise: float) -> float:
+    """Return how far off a pose that is determined may be, metres. sensor_noise: metres."""
+    return max(min(SURE_SHARE * sdf.diameter, SURE_WITHIN), LEAST_LEVELS * sensor_noise)
 
 
 def fits_elsewhere(
@@ -254,14 +280,23 @@ def check_trust(trust: Trust, sensor_noise: float = SENSOR_NOISE) -> list[Points
             "the object and its scale, and whether it moved"
         )
         return [PointsWarning("no_fit", text)]
-    if trust.misfit <= MOST_LEVELS:
+    most = most_error(trust.redundancy, sensor_noise) / sensor_noise
+    if trust.misfit <= most:
         return []
     text = (
-        f"points are more than {MOST_LEVELS:g} noise levels off the best hypothesis on average, "
+        f"points are more than {most:g} noise levels off the best hypothesis on average, "
         f"see the trust in the result: the sensor is less exact than {sensor_noise:g} m, the "
         "object is not quite this one, or a better pose was not found"
     )
     return [PointsWarning("above_noise", text)]
+
+
+def most_error(redundancy: int, sensor_noise: float) -> float:
+    """Return the mean error of points up to which a sensor's noise explains it, metres.
+
+    redundancy: known points beyond those that a pose can fit.
+    """
+    return sensor_noise * (MOST_LEVELS_OF_MANY if redundancy >= MANY_BEYOND else MOST_LEVELS)
 
 
 def correlation(points: FloatArray, errors: FloatArray) -> float:
@@ -361,11 +396,12 @@ def motion_cost(
     and v^T M v by which the surface leaves itself. Likely: by a likelihood ratio (Wilks, 1938), see
     `LIMIT`.
     """
-    motions = _loosest_motions(problem, pose)
+    noise = noise_model(sensor_noise)
+    motions = _loosest_motions(problem, pose, noise=noise)
     if len(motions) == 0:
         return math.inf
     moved = _moved(problem, pose, twists=distance * np.concatenate([motions, -motions]))
-    energies = pose_energies(problem, Poses.joined([pose, moved]), noise=noise_model(sensor_noise))
+    energies = pose_energies(problem, Poses.joined([pose, moved]), noise=noise)
     apart = outline_distances_to(
         problem.sdf, moved, other=pose
     )  # near for turns that are symmetries
@@ -373,8 +409,11 @@ def motion_cost(
     return float(rises[apart >= 0.5 * distance].min(initial=math.inf))
 
 
-def _loosest_motions(problem: RegistrationProblem, pose: Poses) -> FloatArray:
-    """Return twists (K, 6) as `_moved` takes them, K at most 6, by which the surface moves by 1."""
+def _loosest_motions(problem: RegistrationProblem, pose: Poses, *, noise: NoiseModel) -> FloatArray:
+    """Return twists (K, 6) as `_moved` takes them, K at most 6, by which the surface moves by 1.
+
+    A turn of a contact's normal counts as the distance that is as unlikely, at the middle level.
+    """
     sdf, step = problem.sdf, 0.5 * problem.sdf.resolution
     nearby = _moved(problem, pose, twists=step * np.concatenate([np.eye(6), -np.eye(6)]))
 
@@ -386,12 +425,24 @@ def _loosest_motions(problem: RegistrationProblem, pose: Poses) -> FloatArray:
 
     known = problem.points.known[evenly_spaced(len(problem.points.known), _MOST_KNOWN)]
     resisted = products(known) + _SOFT * np.eye(6)
+    if problem.points.has_normals:
+        level = noise.sigmas[len(noise.sigmas) // 2] / _arm(sdf)  # of a turn, as `_moved` takes it
+        resisted[3:, 3:] += level**2 * _normal_products(problem.points, pose, noise=noise)
     metric = products(outline_in_world(sdf, pose)[0])
     motions = np.eye(6)
     for _ in range(_ROUNDS):
         motions = _solved(resisted, in_order(metric * motions[:, None]))
         motions = _orthonormal(motions, metric)
     return motions
+
+
+def _normal_products(points: KnownPoints, pose: Poses, *, noise: NoiseModel) -> FloatArray:
+    """Return means (3, 3) of (I - m m^T) / v over known points, of normals m of variance v."""
+    variances = noise.normal_variances(points.normal_noise)
+    normals = rotated(pose.rotations[0], points.normals)
+    across = np.eye(3) - normals[:, :, None] * normals[:, None]
+    weighted = np.where(variances > 0.0, 1.0 / np.where(variances > 0.0, variances, 1.0), 0.0)
+    return in_order((weighted[:, None, None] * across).T) / len(variances)
 
 
 def _orthonormal(vectors: FloatArray, metric: FloatArray) -> FloatArray:
@@ -416,10 +467,15 @@ def _moved(problem: RegistrationProblem, pose: Poses, *, twists: FloatArray) -> 
     Turns are lengths of arc at half a diameter.
     """
     centre = problem.sdf.bounds.mean(axis=0)
-    turn = rotation_vector(twists[:, 3:] / max(0.5 * problem.sdf.diameter, problem.sdf.resolution))
+    turn = rotation_vector(twists[:, 3:] / _arm(problem.sdf))
     shift = centre + twists[:, :3] - rotated(turn, centre)
     turned = product(turn, np.broadcast_to(pose.rotations, turn.shape))
     return Poses.of(compose(turned, rotated(turn, pose.translations) + shift))
+
+
+def _arm(sdf: SdfGrid) -> float:
+    """Return the length at which arcs of turns are measured, metres."""
+    return max(0.5 * sdf.diameter, sdf.resolution)
 
 
 def pose_energies(problem: RegistrationProblem, poses: Poses, *, noise: NoiseModel) -> FloatArray:

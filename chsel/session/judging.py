@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -19,12 +20,14 @@ from chsel.problem.trust import (
     DETERMINED,
     MANY_CONTACTS,
     SENSOR_NOISE,
+    SURE_TURN,
     WIDE,
     explaining,
     fits_elsewhere,
     has_pose,
     pose_energies,
     posed_normals,
+    sure_within,
     trust_in,
 )
 
@@ -53,7 +56,8 @@ def trust_by(
     among them turns under which the object looks nearly alike, and poses that leave out one of few
     contacts. Of many contacts, `anchored` has done this search itself. Where pushes may have moved
     the object, it has to stand also beside what is found for other distances of them. How far the
-    pose may be off is in `centre_within` and `turn_within`, by `pose_bound`.
+    pose may be off is in `centre_within` and `turn_within`, by `pose_bound`; by more than
+    `sure_within` or SURE_TURN, it is not determined.
     """
     if not has_pose(hypotheses):
         return None
@@ -70,6 +74,11 @@ def trust_by(
         trust = replace(trust, verdict=WIDE, modes=0, reason=reason)
     poses, _ = explaining(carried, hypotheses, sensor_noise=noise, rivals=rivals)
     centre, turn = pose_bound(carried.sdf, poses)
+    most = sure_within(carried.sdf, noise)
+    if trust.verdict == DETERMINED and (centre > most or turn > SURE_TURN):
+        limits = f"{1000.0 * most:.1f} mm or {math.degrees(SURE_TURN):.0f}°"
+        reason = f"poses more than {limits} off explain the points"
+        trust = replace(trust, verdict=WIDE, modes=0, reason=reason)
     return replace(trust, centre_within=centre, turn_within=turn)
 
 

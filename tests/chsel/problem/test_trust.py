@@ -19,8 +19,10 @@ from chsel.problem.trust import (
     FOREIGN_CONTACT,
     LEAST_GAP,
     LEAST_LEVELS,
+    MANY_BEYOND,
     MANY_CONTACTS,
     MOST_LEVELS,
+    MOST_LEVELS_OF_MANY,
     MOST_MODES,
     MOST_NOISE,
     MOST_OFF,
@@ -113,8 +115,10 @@ def test_numbers_are_those_of_the_points_at_the_best_hypothesis():
     assert trust.noise == pytest.approx(0.002, rel=0.15)
     assert trust.misfit == pytest.approx(math.sqrt(2.0 / math.pi) * 2.0, rel=0.15)
     assert trust.outliers < 0.01
-    for misfit, codes in ((MOST_LEVELS, []), (1.001 * MOST_LEVELS, ["above_noise"])):
-        assert [each.code for each in check_trust(replace(trust, misfit=misfit))] == codes
+    for beyond, most in ((MANY_BEYOND - 1, MOST_LEVELS), (MANY_BEYOND, MOST_LEVELS_OF_MANY)):
+        for misfit, codes in ((most, []), (1.001 * most, ["above_noise"])):
+            judgement = replace(trust, misfit=misfit, redundancy=beyond)
+            assert [each.code for each in check_trust(judgement)] == codes
     upright = hypotheses(compose(np.eye(3), CENTRE))  # on its axes the grid is exact
     known = CENTRE[None] + np.array([RADIUS + 0.0005, 0.0, 0.0])
     one = judged(upright, NOISE, known=known, free=CENTRE[None] + 0.9)
@@ -290,6 +294,18 @@ def test_the_text_ends_with_how_far_the_pose_may_be_off():
     assert "turn_within" not in trust.numbers
 
 
+def test_errors_that_the_stated_noise_does_not_explain_make_a_result_wide():
+    """Of 0.5 mm where 1 mm is stated, and of 8 mm: far above that, though the pose is right."""
+    for noise, verdict in ((0.0005, "determined"), (0.008, "wide")):
+        trust = judged(hypotheses(POSE), NOISE, sdf=GRID, known=on_box(noise=noise))
+        assert trust.verdict == verdict
+        warned = [each.code for each in check_trust(trust, NOISE)]
+        assert warned == (["above_noise"] if verdict == "wide" else [])
+    assert trust.reason == "errors far above the noise of 1 mm that is stated"
+    stated = judged(hypotheses(POSE), 8.0 * NOISE, sdf=GRID, known=on_box(noise=0.008))
+    assert (stated.verdict, check_trust(stated, 8.0 * NOISE)) == ("determined", [])
+
+
 @pytest.mark.usefixtures("held")
 def test_poses_within_the_noise_are_one_mode():
     """A ball whose distances are known to points on a ring is on one side of the ring or another.
@@ -306,7 +322,7 @@ def test_poses_within_the_noise_are_one_mode():
     signs = np.random.default_rng(0).choice([-1.0, 1.0], count)
     for noise, modes in ((0.8 * apart / LEAST_GAP, 2), (1.2 * apart / LEAST_GAP, 1)):
         points = {"known": CENTRE + ring, "known_sdf": distances + noise * signs}
-        trust = judged(hypotheses(*places), NOISE, **points)
+        trust = judged(hypotheses(*places), 3.0 * NOISE, **points)
         assert trust.noise == pytest.approx(noise, rel=0.1)
         assert trust.modes == modes
 
