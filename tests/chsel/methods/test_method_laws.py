@@ -95,7 +95,7 @@ def test_contacts_that_count_twice_are_those_of_twice_the_weight(name, preset):
 
     `cvo` compares whole clouds, in which free points then weigh half as much.
     """
-    points = replace(FEW, known=np.repeat(FEW.known, 2, axis=0), known_sdf=None)
+    points = FEW.with_known(np.repeat(np.arange(len(FEW.known)), 2))
     method = quick(name, preset)
     found = method.register(replace(PROBLEM, points=points))
     cost = getattr(method.settings, "cost", None)
