@@ -49,7 +49,7 @@ def test_the_true_object_comes_first(tmp_path):
 
 
 def test_the_object_whose_normals_fit_comes_first():
-    """Contacts on two sides 8 cm apart: tilted, the box of 6 cm has the places, and no such sides."""
+    """Contacts are on sides 8 cm apart: the other box has the places if tilted, no such sides."""
     meshes = {"wide": trimesh.creation.box((0.08, 0.12, 0.12))}
     meshes["slim"] = trimesh.creation.box((0.06, 0.1, 0.1))
     places = np.array([[0.04, 0.02, 0.03], [0.04, -0.02, -0.02], [-0.04, 0.02, -0.03]])

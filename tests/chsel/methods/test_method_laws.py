@@ -116,8 +116,8 @@ def test_normals_turn_with_the_world_and_go_with_their_points():
     order = np.random.default_rng(0).permutation(12)
     permuted = replace(problem, points=problem.points.with_known(order))
     assert_alike(quick("anchored").register(permuted))
-    mixed = replace(few, free=FEW.free[:0], normals=few.normals[order])
-    mixed = replace(problem, points=replace(mixed, normal_noise=few.normal_noise[order]))
+    normals = {"normals": few.normals[order], "normal_noise": few.normal_noise[order]}
+    mixed = replace(problem, points=replace(problem.points, **normals))
     assert quick("anchored").register(mixed).cost[0] > expected.cost[0] + 10.0
     turn = compose(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
     corners = apply(turn, np.array(WORKSPACE.bounds))
