@@ -33,7 +33,8 @@ from chsel.problem.surface import has_surface, surface_points
 
 UNIT = 2.0**-14  # metres that scores count in, so that a table of 16 bits reaches 2 m
 NO_POSE = 2**62  # above the keys of all poses
-_ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+_ZERO, _HALF = np.float32(0.0), np.float32(0.5)
+_ONE = np.float32(1.0)
 _MOST_SAMPLES = 100_000_000
 _MOST_KEPT = 100_000
 _SURFACE_POINTS = 400  # of which 80 000 pairs are of all lengths

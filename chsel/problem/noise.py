@@ -1,15 +1,16 @@
 """A model of the errors of points, and the energy of poses by it.
 
     E(X) = -log sum_k w_k prod_i [(1 - e) N(r_i; 0, s_k) F_i + e / D]^t
-           + t sum_j min(d_j^2 / 2 f^2, c)
+           + t F(sum_j min(d_j^2 / 2 f^2, c))
 
 in nats, up to a constant: minus the log-likelihood of a pose by all points. Known points have
 residuals r_i = s(X p_i) - v_i, free points depths d_j below the surface, occupied ones heights d_j
 above it. Contacts are off by s_k^2 = n^2 + m_k^2: the noise n of the sensor, and errors m_k of
 mesh, hand and camera, of which only a prior w_k is known; so the sum over k is the evidence for
 the pose. A share e of the contacts is on other objects, anywhere within D. The border of a free
-voxel is off by f, and one in exp(c) is wrong. Many points have errors in common: with
-N > INDEPENDENT known ones, t is INDEPENDENT / N.
+voxel is off by f, and one in exp(c) is wrong; where one is, others are likelier to be, so beyond c
+costs count less (F). Many points have errors in common: with N > INDEPENDENT known ones, t is
+INDEPENDENT / N.
 
 F_i is 1 for a contact without a normal. Else it is the density of the normal by that of a uniform
 direction, where a share a of the normals is wrong:
@@ -43,6 +44,7 @@ _LEAST_ERROR, _MOST_ERROR = 0.0006, 0.008  # metres: m_1 and m_K, in geometric s
 _USUAL_ERROR, _WIDTH = 0.002, 0.6  # of w: centre in metres, standard deviation of ln m
 SHARE, EXTENT = 0.03, 0.15  # e, and D in metres
 SOFTNESS, WRONG = 0.002, 7.0  # f in metres, and c
+LATER = 0.2  # of the costs beyond c
 FACET = 0.05  # radians: what normals are off as a surface is not flat, about each axis
 WRONG_NORMALS = 0.1  # a
 INDEPENDENT = 30.0  # known points: of more, errors are alike
@@ -146,7 +148,7 @@ class NoiseModel:
         known = least - logs(exps(least[:, None] - levels).sum(axis=1))
         deep = np.maximum(depths - self.shared, 0.0)
         wrong = np.minimum(0.5 * (deep / self.softness) ** 2, self.wrong).sum(axis=1)
-        return known + power * wrong
+        return known + power * np.minimum(wrong, self.wrong + LATER * (wrong - self.wrong))
 
     def _factors(self, variances: FloatArray, normals: PosedNormals) -> FloatArray:
         """Return F (B, N)."""

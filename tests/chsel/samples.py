@@ -10,7 +10,7 @@ import trimesh
 
 from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.problem.initial_sets import posed_problem
-from chsel.problem.noise import EXTENT, FACET, INDEPENDENT, SHARE, WRONG_NORMALS
+from chsel.problem.noise import EXTENT, FACET, INDEPENDENT, LATER, SHARE, WRONG_NORMALS
 from chsel.problem.poses import apply, compose, hat, random_rotations
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.sdf_grid import SdfGrid
@@ -107,6 +107,8 @@ def plain_energy(noise, residuals, *, depths, normals=None):
         min(max(depth - noise.shared, 0.0) ** 2 / (2.0 * noise.softness**2), noise.wrong)
         for depth in depths
     )
+    if wrong > noise.wrong:
+        wrong = noise.wrong + LATER * (wrong - noise.wrong)
     return -most - math.log(sum(math.exp(one - most) for one in logs)) + power * wrong
 
 

@@ -18,7 +18,7 @@ from chsel.numerics.elementary import exp, log
 from chsel.numerics.near_points import NearPoints, gather, near_points_for, select, to_cells
 from chsel.numerics.pose_tuples import moved, pose_at, rigid, turned
 from chsel.numerics.threads import parallel_for
-from chsel.problem.noise import EXTENT, SHARE, WRONG_NORMALS, NoiseModel
+from chsel.problem.noise import EXTENT, LATER, SHARE, WRONG_NORMALS, NoiseModel
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses
 from chsel.problem.prior_kernels import Prior, prior_energy, prior_of
@@ -56,6 +56,7 @@ class Likelihood(NamedTuple):
     power: float  # t
     softness: float  # metres
     wrong: float  # nats
+    later: float  # share of costs beyond
     prior: Prior  # on the pose, a further factor
 
 
@@ -80,6 +81,7 @@ def likelihood_of(noise: NoiseModel, known: KnownPoints, *, prior: Prior) -> Lik
         power=noise.power(len(known.known)),
         softness=noise.softness,
         wrong=noise.wrong,
+        later=LATER,
         prior=prior,
     )
 
@@ -140,7 +142,7 @@ def energies_of(model, likelihood, poses, out, first, last, work):
         pose = pose_at(poses, n)
         known = known_energy(model, likelihood, pose, np.inf, work.levels)
         gather_free(model, pose, 0.0, work)
-        out[n] = energy_below(model, likelihood, pose, known, np.inf, work)
+        out[n] = energy_below(model, likelihood, pose, known, np.inf, work)[0]
 
 
 @leaf
@@ -150,7 +152,9 @@ def known_energy(model, likelihood, pose, limit, levels):
     levels (K,) become the posterior weights of the levels of noise.
     """
     known = model.known
-    table, foreign, power = likelihood.densities, likelihood.foreign, likelihood.power
+    table = likelihood.densities
+    foreign = likelihood.foreign
+    power = likelihood.power
     count, size = known.shape[1], np.uint64(_LEVELS)
     offset = prior_energy(likelihood.prior, pose)
     if offset > limit:
@@ -245,42 +249,52 @@ def known_slope(likelihood, residual, factor, levels):
 
 
 @leaf
-def _depth_energy(likelihood, depth):
-    """Return the energy of a free or occupied point so deep on the wrong side, metres."""
+def _depth_cost(likelihood, depth):
+    """Return the cost of a free or occupied point so deep on the wrong side, metres."""
     ratio = depth / likelihood.softness
-    return likelihood.power * min(0.5 * ratio * ratio, likelihood.wrong)
+    return min(0.5 * ratio * ratio, likelihood.wrong)
 
 
 @leaf
-def depth_slope(likelihood, depth):
-    """Return the derivative of _depth_energy by half of the squared depth."""
+def _depth_energy(likelihood, costs):
+    """Return the energy of all points on the wrong side, whose costs have this sum."""
+    beyond = likelihood.later * (costs - likelihood.wrong)
+    return likelihood.power * min(costs, likelihood.wrong + beyond)
+
+
+@leaf
+def depth_slope(likelihood, depth, costs):
+    """Return the derivative of _depth_energy by half of one squared depth."""
     ratio, softness = depth / likelihood.softness, likelihood.softness
     if 0.5 * ratio * ratio >= likelihood.wrong:
         return 0.0
-    return likelihood.power / (softness * softness)
+    share = 1.0 if costs <= likelihood.wrong else likelihood.later
+    return share * likelihood.power / (softness * softness)
 
 
 @leaf
 def energy_below(model, likelihood, pose, known, limit, work):
     """Return an energy of `known_energy` plus that of occupied and of gathered free points.
 
-    It is infinite above a limit.
+    It is infinite above a limit. Also return the sum of the costs of the latter.
     """
     occupied = model.occupied
     table = model.field.table
-    total = known
+    costs = 0.0
     for n in range(occupied.shape[1]):
         s = distance_at(model.field, pose, occupied[0, n], occupied[1, n], occupied[2, n])
-        total += _depth_energy(likelihood, max(s + model.alpha, 0.0))
+        costs += _depth_cost(likelihood, max(s + model.alpha, 0.0))
     across, along = np.int64(model.field.box.across), np.int64(model.field.box.along)
+    total = known + _depth_energy(likelihood, costs)
     for n in range(look_around(model, pose, work)):
         if not total <= limit:
             break
         cell, u, v, w = free_cell(model, pose, free_point(model, work, n))
         if cell >= 0:
             s = value_between_nodes(table, cell, across, along, u, v, w)
-            total += _depth_energy(likelihood, max(model.alpha - s, 0.0))
-    return total if total <= limit else np.inf
+            costs += _depth_cost(likelihood, max(model.alpha - s, 0.0))
+            total = known + _depth_energy(likelihood, costs)
+    return total if total <= limit else np.inf, costs
 
 
 @inner

@@ -118,8 +118,8 @@ def _fitted(model, likelihood, twists, pose, steps, fit):
     dimension, damping = len(twists.basis), _FIRST_DAMPING
     gather_free(model, pose, _SLACK, fit.work)
     known = known_energy(model, likelihood, pose, np.inf, fit.work.levels)
-    energy = energy_below(model, likelihood, pose, known, np.inf, fit.work)
-    _linearise(model, likelihood, twists, pose, fit)
+    energy, costs = energy_below(model, likelihood, pose, known, np.inf, fit.work)
+    _linearise(model, likelihood, twists, pose, costs, fit)
     for _ in range(steps):
         trace = 0.0
         for i in range(dimension):
@@ -130,14 +130,14 @@ def _fitted(model, likelihood, twists, pose, steps, fit):
         if travel(model.free, trial, fit.work.memory) > _SLACK:
             gather_free(model, trial, _SLACK, fit.work)
         known = known_energy(model, likelihood, trial, energy, fit.work.levels)
-        tried = energy_below(model, likelihood, trial, known, energy, fit.work)
+        tried, costs = energy_below(model, likelihood, trial, known, energy, fit.work)
         if tried < energy:
             gain = energy - tried
             pose, energy = trial, tried
             damping *= _LESS
             if gain < _ENOUGH * tried:
                 break
-            _linearise(model, likelihood, twists, pose, fit)
+            _linearise(model, likelihood, twists, pose, costs, fit)
         else:
             damping *= _MORE
             if damping > _MOST_DAMPING:
@@ -146,8 +146,8 @@ def _fitted(model, likelihood, twists, pose, steps, fit):
 
 
 @inner
-def _linearise(model, likelihood, twists, pose, fit):
-    """Fill the normal equations at a pose."""
+def _linearise(model, likelihood, twists, pose, costs, fit):
+    """Fill the normal equations at a pose; costs: of free and occupied points, see energy_below."""
     field = model.field
     sums = fit.sums
     work = fit.work
@@ -173,14 +173,14 @@ def _linearise(model, likelihood, twists, pose, fit):
             looked_up = distance_between_nodes(field.box, field.table, cell, u, v, w)
             depth = model.alpha - looked_up[0]
             if depth > 0.0:
-                slope = depth_slope(likelihood, depth)
+                slope = depth_slope(likelihood, depth, costs)
                 _add(sums, twists.pivot, pose, point, looked_up, -depth, slope)
     for n in range(model.occupied.shape[1]):
         point = model.occupied[0, n], model.occupied[1, n], model.occupied[2, n]
         looked_up = distance_with_gradient(field, pose, point[0], point[1], point[2])
         height = looked_up[0] + model.alpha
         if height > 0.0:
-            slope = depth_slope(likelihood, height)
+            slope = depth_slope(likelihood, height, costs)
             _add(sums, twists.pivot, pose, point, looked_up, height, slope)
     _restrict(twists, fit)
 

@@ -141,7 +141,7 @@ def walk_below(model, likelihood, stride, floor, chains, stream, moves, first, l
                     if far or slack > _TOO_MUCH * wanted:
                         slack = wanted
                         gather_free(model, trial, slack, work)
-                    total = energy_below(model, likelihood, trial, total, limit, work)
+                    total = energy_below(model, likelihood, trial, total, limit, work)[0]
                     accepted = total <= limit
             if accepted:
                 pose, energy = trial, total
