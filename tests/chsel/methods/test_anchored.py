@@ -35,6 +35,7 @@ from chsel.problem.poses import (
     inverse,
     rotation_angle,
 )
+from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import NullObserver, check_prior
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import PlaneSettings, search_space
@@ -561,3 +562,21 @@ def test_poses_of_a_prior_are_searched_from():
     assert_found(method.register(replace(problem, prior=prior)))
     energies = [method.register(replace(problem, prior=p)).cost[0] for p in (prior, None)]
     assert energies[0] < energies[1] - 10.0
+
+
+def test_a_prior_is_on_the_pose_before_the_pushes_that_are_found():
+    """Five pushes by 4 mm along x, each after eight contacts: a prior on where it is now is off."""
+    pushed = TRUTH.copy()
+    pushed[0, 3] += 0.02
+    points = touched(slice(0, 48))
+    known = points.known + np.repeat(np.arange(6), 8)[:, None] * [0.004, 0.0, 0.0]
+    before = np.array([[0, 0, 8 * n] for n in range(1, 6)])
+    along = Pushes(np.tile([1.0, 0.0, 0.0], (5, 1)), before, largest=0.008)
+    method = anchored()
+    problem = replace(posed(method, replace(points, known=known)), pushes=along)
+    for truth, warned in ((TRUTH, False), (pushed, True)):
+        prior = PosePrior(centre=truth[:3, 3], centre_noise=0.002, point=np.zeros(3))
+        found = method.register(replace(problem, prior=prior))
+        assert found.push_distance == pytest.approx(0.004, abs=1e-4)
+        np.testing.assert_allclose(found.world_from_object[0], pushed, atol=2e-3)
+        assert bool(check_prior(replace(problem, prior=prior), found)) is warned
