@@ -38,7 +38,7 @@ from chsel.problem.registration_problem import Hypotheses, Observer, check_prior
 from chsel.problem.sdf_grid import SdfGrid, object_grid
 from chsel.problem.streams import StreamKey
 from chsel.problem.trust import check_trust
-from chsel.session.judging import noise_of, trust_by
+from chsel.session.judging import check_normals, noise_of, trust_by
 from chsel.session.perception import known_points, refuse_surface
 
 if TYPE_CHECKING:
@@ -159,6 +159,7 @@ def register(
     trust = trust_by(solver, problem, hypotheses=result)
     if trust is not None:
         _warn(check_trust(trust, noise_of(solver)) + check_prior(problem, result))
+        _warn(check_normals(solver, problem, hypotheses=result))
     return replace(result, trust=trust)
 
 

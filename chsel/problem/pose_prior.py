@@ -23,6 +23,7 @@ from chsel.errors import (
     PoseError,
     SettingError,
     quoted,
+    require_between,
     require_instance,
     require_positive,
 )
@@ -41,6 +42,7 @@ from chsel.problem.poses import (
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.surface import has_surface, in_order, object_centre
 
+LEAST_NOISE = 1e-9  # metres or radians: less is taken for a mistake
 MOST_POSES = 200  # of another estimator: every energy looks at all of them
 SURE = 5.0  # nats beyond the mean cost of a right prior, above which the points contradict it
 _ROUNDED = 1e-14  # by which squares of unit vectors and sums of weights are off after division
@@ -86,9 +88,12 @@ class PosePrior(ShapesShown):
             if getattr(self, name) is not None:
                 require_positive(name, getattr(self, name))
                 self._set(name, float(getattr(self, name)))
-        if self.axis_noise is not None and self.axis_noise > math.pi:
+        if self.centre_noise is not None:
+            require_between("centre_noise", self.centre_noise, low=LEAST_NOISE, high=FARTHEST_PLACE)
+        if self.axis_noise is not None and not LEAST_NOISE <= self.axis_noise <= math.pi:
+            doubt = ": in degrees?" if self.axis_noise > math.pi else ";"
             raise SettingError(
-                f"axis_noise is {self.axis_noise:g}: in degrees? accepted: up to pi, radians"
+                f"axis_noise is {self.axis_noise:g}{doubt} accepted: {LEAST_NOISE:g} to pi, radians"
             )
         if self.object_from_world is not None:
             self._set_poses(self.object_from_world, self.covariances, weights=self.weights)
@@ -303,6 +308,14 @@ def _check_covariances(covariances: FloatArray) -> None:
     asymmetry = np.abs(covariances - np.swapaxes(covariances, 1, 2)).max(axis=(1, 2))
     definite = _cholesky(covariances)[1]
     good = definite & (asymmetry <= _SYMMETRIC * sizes)
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    within = (variances >= LEAST_NOISE**2) & (variances <= FARTHEST_PLACE**2)
+    if good.all() and not within.all():
+        j, i = np.argwhere(~within)[0].tolist()
+        raise PoseError(
+            f"covariances[{j}, {i}, {i}] is {variances[j, i]:.3g}; accepted: squares of "
+            f"{LEAST_NOISE:g} to {FARTHEST_PLACE:g}, metres and radians"
+        )
     if not good.all():
         raise PoseError(
             f"covariances[{int(np.argmin(good))}] is not a covariance; accepted: a symmetric, "

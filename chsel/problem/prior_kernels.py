@@ -17,6 +17,7 @@ from chsel.problem.poses import Poses
 from chsel.problem.sdf_grid import SdfGrid
 
 _LEAST_SHARE = 1e-9  # of a pose of another estimator in the gradient
+_FAR = 100.0  # squared Mahalanobis distance beyond which a Gaussian counts for nothing, e^-50
 _SMALL = 0.01  # radians, below which a series is more accurate
 
 
@@ -112,7 +113,10 @@ def add_prior(prior, pose, pivot, sums):
         x, y, z = turned(pose, prior.along[n, 0], prior.along[n, 1], prior.along[n, 2])
         off = x - prior.axis[n, 0], y - prior.axis[n, 1], z - prior.axis[n, 2]
         _add_vector(sums, (x, y, z), off, chance * prior.axis_precision, 0.0)
+    place = _place(prior, pose)
     for j in range(len(prior.poses)):
+        if not _is_near(prior, place, j):
+            continue
         offset = _offset(prior, pose, j)
         density = _density(prior, offset, j)
         if density > _LEAST_SHARE * total:
@@ -138,9 +142,31 @@ def _quadratic_cost(prior, pose):
 def _mixture(prior, pose):
     """Return sum_j g_j."""
     total = 0.0
+    place = _place(prior, pose)
     for j in range(len(prior.poses)):
-        total += _density(prior, _offset(prior, pose, j), j)
+        if _is_near(prior, place, j):
+            total += _density(prior, _offset(prior, pose, j), j)
     return total
+
+
+@leaf
+def _place(prior, pose):
+    """Return where the object's centre is in a pose, world, metres."""
+    x, y, z = prior.middle
+    return turned_back(pose, x - pose[9], y - pose[10], z - pose[11])
+
+
+@leaf
+def _is_near(prior, place, j):
+    """Return whether g_j can count where the object's centre is at a place, whatever the turn."""
+    x, y, z = place
+    x, y, z = x - prior.centres[j, 0], y - prior.centres[j, 1], z - prior.centres[j, 2]
+    square = 0.0
+    for k in range(3):  # whitening is lower triangular
+        white = prior.whitening[j, k, 0] * x
+        white += prior.whitening[j, k, 1] * y + prior.whitening[j, k, 2] * z
+        square += white * white
+    return square < _FAR
 
 
 @leaf
@@ -165,8 +191,7 @@ def _whitened(prior, offset, j, k):
 @inner
 def _offset(prior, pose, j):
     """Return how a pose is off pose j: of the centre, metres, and the rotation vector, world."""
-    middle = prior.middle
-    x, y, z = turned_back(pose, middle[0] - pose[9], middle[1] - pose[10], middle[2] - pose[11])
+    x, y, z = _place(prior, pose)
     other = pose_at(prior.poses, j)
     a, d, g = turned_back(pose, other[0], other[3], other[6])
     b, e, h = turned_back(pose, other[1], other[4], other[7])

@@ -1,14 +1,19 @@
-"""Whether a result stands: beside what a search for rivals finds, and for pushes not expected."""
+"""Whether a result stands: beside what a search for rivals finds, and for input not expected."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 
+import numpy as np
+
+from chsel.errors import PointsWarning
 from chsel.methods.anchored.anchored import Anchored
 from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.methods.anchored.pose_bound import pose_bound
 from chsel.methods.method import Method
+from chsel.problem.noise import noise_model
+from chsel.problem.poses import Poses
 from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.trust import (
@@ -20,11 +25,20 @@ from chsel.problem.trust import (
     explaining,
     fits_elsewhere,
     has_pose,
+    pose_energies,
+    posed_normals,
     sure_within,
     trust_in,
 )
 
+FLIPPED = "normals_flipped"
+"""The code of the warning about normals that point into the object."""
+
 _CLOSE = 2.0  # noise levels: a misfit that needs no explanation
+_LEAST_NORMALS = 3  # fewer fit some pose either way
+_INWARD = -0.5  # cosine with the object's normal, below which one points into the object
+_UNEXPLAINED = 2.0  # nats a normal: a best pose of less needs no explanation
+_BETTER = 5.0  # nats by which flipped normals have to explain the points better
 
 
 def noise_of(method: Method) -> float:
@@ -66,6 +80,47 @@ def trust_by(
         reason = f"poses more than {limits} off explain the points"
         trust = replace(trust, verdict=WIDE, modes=0, reason=reason)
     return replace(trust, centre_within=centre, turn_within=turn)
+
+
+def check_normals(
+    method: Method, problem: RegistrationProblem, *, hypotheses: Hypotheses
+) -> list[PointsWarning]:
+    """Return a warning if flipped normals explain the points better; the best pose is finite.
+
+    A search reads normals, so that flipped ones draw it to poses that agree with them. So where the
+    best hypothesis leaves normals unexplained, poses are sought once more with all turned around.
+    """
+    problem = problem.carried(hypotheses.push_distance)
+    sdf, points = problem.sdf, problem.points
+    known = points.normal_noise > 0.0
+    count = int(known.sum())
+    if count < _LEAST_NORMALS:
+        return []
+    noise = noise_of(method)
+    model = noise_model(noise)
+    best = Poses.of(hypotheses.object_from_world[:1])
+    agree = (posed_normals(sdf, points, poses=best).cosines[0][known] > -_INWARD).all()
+    explained = _UNEXPLAINED * model.power(len(known)) * count
+    if agree or pose_energies(problem, best, noise=model)[0] <= explained:
+        return []
+    flipped = replace(problem, points=replace(points, normals=-points.normals))
+    search = method if isinstance(method, Anchored) else _search(noise)
+    poses = [best, search.minima(flipped)]
+    if search is not method:  # which may not have found the best pose with the normals as they are
+        poses.append(search.minima(problem))
+    every = Poses.joined(poses)
+    energies = pose_energies(flipped, every, noise=model)
+    least = pose_energies(problem, every, noise=model).min()
+    there = every[np.argmin(energies)[None]]
+    cosines = posed_normals(sdf, points, poses=there).cosines[0][known]
+    inward = int((cosines < _INWARD).sum())
+    if inward <= (cosines > -_INWARD).sum() or energies.min() > least - _BETTER:
+        return []
+    text = (
+        f"{inward} of {count} normals point into the object at the pose that explains the points "
+        "best: are they flipped? accepted: unit vectors out of the object"
+    )
+    return [PointsWarning(FLIPPED, text)]
 
 
 def unexpected_push(

@@ -30,7 +30,7 @@ from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.points import check_contacts, check_points
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust, check_prior
 from chsel.problem.trust import check_trust
-from chsel.session.judging import noise_of, unexpected_push
+from chsel.session.judging import FLIPPED, check_normals, noise_of, unexpected_push
 from chsel.session.loop import Loop
 from chsel.session.recording import (
     NO_RESULT,
@@ -212,6 +212,8 @@ class Run:
             self.trust = trust
             self.warn(check_trust(trust, noise_of(self.method)))
             self.warn(check_prior(problem, self.answer))
+            if all(earlier.code != FLIPPED for earlier in self.warnings):
+                self.warn(check_normals(self.method, problem, hypotheses=self.answer))
         self.belief = self.registered.belief or self.belief
         return self.answer
 

@@ -17,6 +17,7 @@ from chsel.errors import PointsError, SettingError, quoted, require_choice
 from chsel.next_probe.decision_problem import Actions
 from chsel.problem.mesh import clean_mesh, load_mesh
 from chsel.problem.points import FREE_RESOLUTION, POINT_CLASSES, Workspace
+from chsel.problem.pose_prior import prior_from_settings
 from chsel.problem.poses import inverse
 from chsel.problem.settings import CheckedSettings, build_settings, not_negative, positive
 from chsel.session.session import Session
@@ -47,6 +48,7 @@ class OpenRequest(CheckedSettings):
     free_resolution: Annotated[float, positive] = FREE_RESOLUTION
     seed: Annotated[int, not_negative] = 0
     record: str | None = None
+    prior: Any = None
 
 
 def parsed(body: bytes) -> Json:
@@ -73,6 +75,7 @@ def open_session(body: bytes, folder: Path) -> tuple[Session, Json]:
             accepted = "accepted: a name, of a file in the server's folder"
             raise SettingError(f"record is {quoted(request.record)}; {accepted}")
         arguments["record"] = str(folder.resolve() / request.record)
+    arguments["prior"] = prior_from_settings("prior", request.prior)
     session = Session(**arguments)
     return session, {"object": session.started.object, "record": arguments["record"]}
 

@@ -48,6 +48,22 @@ def test_the_true_object_comes_first(tmp_path):
     assert read_recording(tmp_path / "again_slim.mcap").ended.outcome.startswith("failed")
 
 
+def test_the_object_whose_normals_fit_comes_first():
+    """Contacts are on sides 8 cm apart: the other box has the places if tilted, no such sides."""
+    meshes = {"wide": trimesh.creation.box((0.08, 0.12, 0.12))}
+    meshes["slim"] = trimesh.creation.box((0.06, 0.1, 0.1))
+    places = np.array([[0.04, 0.02, 0.03], [0.04, -0.02, -0.02], [-0.04, 0.02, -0.03]])
+    places = np.concatenate([places, [[-0.04, -0.03, 0.02]]])
+    normals = np.sign(places) * [1.0, 0.0, 0.0] @ TRUTH[:3, :3].T
+    energies = []
+    for given in ({}, {"normals": normals, "normal_noise": 0.1}):
+        with chsel.WhichObject(meshes) as which:
+            which.add(contacts=apply(TRUTH, places), **given)
+            energies.append({one.name: one.energy for one in which.register()})
+    assert abs(energies[0]["slim"] - energies[0]["wide"]) < 0.5
+    assert energies[1]["slim"] - energies[1]["wide"] > 9.0
+
+
 def test_a_prior_on_a_single_object_is_refused():
     meshes = {"large": BOX, "small": BOX.copy().apply_scale(0.5)}
     centre = {"centre": TRUTH[:3, 3], "centre_noise": 0.02}

@@ -127,6 +127,28 @@ def test_normals_are_recorded_as_those_of_the_library(server):
     np.testing.assert_array_equal(points.normal_noise, [0.1, 0.0, 0.3, 0.2])
 
 
+def test_a_prior_is_that_of_the_library(server):
+    address, folder = server
+    prior = {"centre": [0.0, 0.01, 0.0], "centre_noise": 0.02}
+    upright = {"axis": [0, 0, 2], "along": [0, 0, 1], "axis_noise": 0.1}
+    path = opened(address, record="prior.mcap", prior=prior | upright)
+    ask(address, f"{path}/add", contacts=ON_BOX)
+    assert ask(address, f"{path}/register", body=b"")[0] == 200
+    ask(address, f"{path}/close", body=b"")
+    recording = read_recording(folder / "prior.mcap")
+    assert recording.problem(0).prior.digest == chsel.PosePrior(**prior, **upright).digest
+    assert outcomes(folder / "prior.mcap") == ([0], "finished")
+    for wrong, text in (
+        ({"center": [0, 0, 0]}, "prior.center does not exist; accepted: centre, centre_noise"),
+        ({"centre": [0, 0, 0]}, "prior: the prior has centre without centre_noise"),
+        (7, "prior is 7; accepted: a mapping of centre"),
+        (prior | {"centre_noise": "a"}, "prior: centre_noise is 'a'"),
+    ):
+        status, answer = ask(address, "/sessions", target=TARGET, prior=wrong)
+        assert status == 400
+        assert answer["error"].startswith(text)
+
+
 def test_others_are_answered_during_a_registration_and_its_own_session_waits(server, monkeypatch):
     address, _ = server
     path, other = opened(address), opened(address)

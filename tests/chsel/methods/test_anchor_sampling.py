@@ -116,10 +116,15 @@ def test_known_points_come_far_apart_first_and_none_is_lost():
     random = np.random.default_rng(2)
     known = random.standard_normal((200, 3))
     values = random.standard_normal(200)
-    ordered = most_informative_first(KnownPoints(known=known, known_sdf=values))
+    normals = known / np.linalg.norm(known, axis=1, keepdims=True)
+    noise = random.uniform(0.1, 0.2, 200)
+    points = KnownPoints(known=known, known_sdf=values, normals=normals, normal_noise=noise)
+    ordered = most_informative_first(points)
     rows = np.lexsort(known.T), np.lexsort(ordered.known.T)
     np.testing.assert_array_equal(known[rows[0]], ordered.known[rows[1]])
     np.testing.assert_array_equal(values[rows[0]], ordered.sdf[rows[1]])
+    np.testing.assert_array_equal(normals[rows[0]], ordered.normals[rows[1]])
+    np.testing.assert_array_equal(noise[rows[0]], ordered.normal_noise[rows[1]])
     first = ordered.known[:8]
     gaps = np.sqrt(((first[:, None] - first[None]) ** 2).sum(axis=2)) + 9.0 * np.eye(8)
     assert gaps.min() > 2.0
@@ -159,6 +164,29 @@ def test_the_worst_contact_can_be_left_out():
     total = costs.sum(axis=1)
     np.testing.assert_allclose(total, np.sort(total), atol=0.002)  # many are out of the grid
     assert trimmed[0] < (costs.sum(axis=1) - costs.max(axis=1))[0]
+
+
+def test_poses_whose_normals_fit_come_first():
+    """A normal costs 20 mm (1 - cos), at most 30 mm; of six contacts, one has none."""
+    contacts = CONTACTS[:6]
+    random = np.random.default_rng(5)
+    normals = random.standard_normal((6, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals[2] = 0.0
+    noise = np.where(np.arange(6) == 2, 0.0, [0.1, 0.3, 0.2, 3.0, 1e-6, 0.2])
+    points = KnownPoints(known=contacts, normals=normals, normal_noise=noise)
+    poses = drawn(points, AnchorSettings(), samples=20_000, most=300)
+    distance = np.minimum(np.abs(distances(poses, contacts, lookup="nearest")), 0.06)
+    rotations = poses[:, :9].reshape(-1, 3, 3)
+    moved = np.einsum("nij,mj->nmi", rotations, contacts) + poses[:, None, 9:]
+    gradients = BOX_GRID.at(moved.reshape(-1, 3), lookup="nearest")[1].reshape(-1, 6, 3)
+    cosines = (np.einsum("nij,mj->nmi", rotations, normals) * gradients).sum(axis=2)
+    off = np.minimum(0.02 * (1.0 - cosines), 0.03) * (noise > 0.0)
+    total = (distance + off).sum(axis=1)
+    np.testing.assert_allclose(total, np.sort(total), atol=0.001)  # gradients have 8 bits
+    assert np.ptp(total) > 0.01
+    without = drawn(replace(points, normals=None, normal_noise=None), AnchorSettings())
+    assert np.abs(without[:20] - poses[:20]).max() > 0.1
 
 
 FAR = inverse(compose(np.tile(np.eye(3), (5, 1, 1)), np.tile([0.5, 0.4, 0.0], (5, 1))))

@@ -25,18 +25,28 @@ from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.basins import basin_bests
 from chsel.problem.noise import LATER, WRONG, noise_model
 from chsel.problem.points import KnownPoints
-from chsel.problem.poses import Poses, apply, axis_angle, check_rigid, compose, inverse
-from chsel.problem.registration_problem import (
-    NullObserver,
+from chsel.problem.pose_prior import PosePrior
+from chsel.problem.poses import (
+    Poses,
+    apply,
+    axis_angle,
+    check_rigid,
+    compose,
+    inverse,
+    rotation_angle,
 )
+from chsel.problem.pushes import Pushes
+from chsel.problem.registration_problem import NullObserver, check_prior
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.subset import surface_descriptors
 from chsel.problem.surface import outline_distances_to
-from chsel.problem.trust import trust_in
+from chsel.problem.trust import pose_energies, trust_in
 from chsel.session.judging import trust_by
 from tests.chsel.methods.scene import (
+    BOX_GRID,
     GRID,
+    MESH,
     ODD,
     POINTS,
     SIDE,
@@ -46,7 +56,7 @@ from tests.chsel.methods.scene import (
     known_points,
     posed,
 )
-from tests.chsel.samples import hypotheses_at, plain_energies
+from tests.chsel.samples import box_with_knob, hypotheses_at, plain_energies
 
 EFFORT = Effort(
     samples=4000,
@@ -61,11 +71,11 @@ EFFORT = Effort(
     polished=4,
     polish_moves=40,
 )
-FEW = replace(POINTS, known=POINTS.known[:2], known_sdf=None)
+FEW = POINTS.with_known(slice(2))
 INEXACT = replace(  # by 2 mm
     POINTS, known=POINTS.known + np.random.default_rng(1).normal(0.0, 0.002, POINTS.known.shape)
 )
-INEXACT_FEW = replace(INEXACT, known=INEXACT.known[:3], known_sdf=None)
+INEXACT_FEW = INEXACT.with_known(slice(3))
 
 
 def anchored(effort=EFFORT, **changes):
@@ -107,7 +117,7 @@ def test_odd_points_have_results(name):
 def test_poses_are_rated_by_some_contacts_that_are_far_apart(contacts):
     method = anchored() if contacts == 64 else anchored(replace(EFFORT, contacts=contacts))
     points = most_informative_first(ODD["hundreds"])
-    few = replace(points, known=points.known[:contacts], known_sdf=points.sdf[:contacts])
+    few = points.with_known(slice(contacts))
     poses = Poses.of(posed(method).initial_set[:4])
     found = Search(posed(method, points), method.settings, observer=NullObserver()).energy.of(poses)
     expected = Energy(posed(method, few), few, noise=noise_model(method.settings.noise)).of(poses)
@@ -411,3 +421,162 @@ def test_hypotheses_are_chosen_for_the_least_expected_plausible_diversity(modes,
         chosen.append(min(others, key=lambda i: expected_diversity([*chosen, i])))
     found = search.choose(candidates).object_from_world
     np.testing.assert_allclose(found, candidates.poses.matrices[sorted(chosen)], atol=1e-9)
+
+
+def touched(chosen, *, noise=0.1):
+    """Contacts (N, 3) of the L at TRUTH with the normals of its faces, some of 400."""
+    places, faces = trimesh.sample.sample_surface(MESH, 400, seed=1)
+    known = apply(TRUTH, np.asarray(places)[chosen])
+    normals = np.asarray(MESH.face_normals)[faces][chosen] @ TRUTH[:3, :3].T
+    return KnownPoints(known=known, normals=normals, normal_noise=np.full(len(known), noise))
+
+
+def test_normals_of_three_contacts_rule_out_most_poses_that_fit_them_and_keep_the_true_one():
+    method = anchored()
+    for seed in range(3):
+        points = touched(np.random.default_rng(seed).choice(400, 3, replace=False))
+        problem = posed(method, points)
+        bare = replace(problem, points=points.without_normals())
+        found, others = method.register(problem), method.register(bare)
+        assert method.holds(bare, others, others.object_from_world).all()
+        assert method.holds(problem, found, others.object_from_world).mean() < 0.5
+        assert method.holds(problem, found, inverse(TRUTH)[None]).all()
+        assert method.holds(problem, found, found.object_from_world).all()
+
+
+def test_the_side_of_a_box_that_was_touched_is_known_by_normals_alone():
+    """Four contacts on its top; without normals it lies above them as well as below."""
+    top = np.array([[0.07, 0.04, 0.04], [-0.06, 0.03, 0.04], [0.0, -0.05, 0.04], [0.01, 0.0, 0.04]])
+    up = np.tile(TRUTH[:3, 2], (4, 1))
+    points = KnownPoints(known=apply(TRUTH, top), normals=up, normal_noise=np.full(4, 0.1))
+    method = anchored()
+    problem = posed(method, points, sdf=BOX_GRID)
+    for given, shares in ((points, (0.0, 0.0)), (points.without_normals(), (0.2, 0.8))):
+        found = method.register(replace(problem, points=given))
+        heights = (found.world_from_object[:, :3, 3] - points.known[3]) @ TRUTH[:3, 2]
+        assert np.abs(heights).min() > 0.035  # half of the least side
+        assert shares[0] <= (heights > 0.0).mean() <= shares[1]
+
+
+def test_a_foreign_contact_with_any_normal_among_eight_moves_nothing():
+    for seed in (10, 11, 12, 15):
+        random = np.random.default_rng(seed)
+        points = touched(random.choice(400, 8, replace=False))
+        normal = random.standard_normal(3)
+        known, normals = points.known.copy(), points.normals.copy()
+        known[-1] += 0.05 * normals[-1]
+        normals[-1] = normal / np.linalg.norm(normal)
+        method = anchored()
+        foreign = replace(points, known=known, normals=normals)
+        position, rotation = pose_errors(
+            method.register(posed(method, foreign)).object_from_world[:1],
+            TRUTH,
+            symmetry=ObjectSymmetry(),
+        )
+        assert position[0] < 0.002
+        assert rotation[0] < 0.02
+
+
+def test_a_hundred_contacts_with_normals_are_found_exactly():
+    method = anchored()
+    found = registered(method, posed(method, touched(slice(0, 100))))
+    position, rotation = pose_errors(found.object_from_world[:1], TRUTH, symmetry=ObjectSymmetry())
+    assert position[0] < 0.0003
+    assert rotation[0] < 0.002
+
+
+def test_normals_count_in_beliefs_and_verdicts_as_in_the_search():
+    """By the formula in numpy, of a result of few contacts and of one with a prior."""
+    points = touched(np.random.default_rng(2).choice(400, 5, replace=False))
+    prior = PosePrior(axis=[0, 0, 1], along=TRUTH[:3, 2], axis_noise=0.1)
+    method = anchored()
+    for given in (None, prior):
+        problem = replace(posed(method, points), prior=given)
+        found = method.register(problem)
+        poses = Poses.of(found.object_from_world)
+        noise = noise_model(method.settings.noise)
+        plain = plain_energies(noise, GRID, points=points, poses=poses)
+        plain += 0.0 if given is None else given.energies(poses, GRID)
+        np.testing.assert_allclose(found.cost, plain, atol=0.1)  # tables of densities
+        np.testing.assert_allclose(pose_energies(problem, poses, noise=noise), plain, atol=1e-6)
+
+
+KNOB_SIDES = np.array([0.2, 0.12, 0.08])
+KNOB, KNOB_PLACES = box_with_knob(KNOB_SIDES)
+"""A box with a knob, of which the contacts leave two modes, turned by pi about its z axis."""
+
+
+def knob_problem(method, prior):
+    points = KnownPoints(known=apply(TRUTH, KNOB_PLACES))
+    grid = SdfGrid.from_mesh(KNOB, 0.005)
+    return replace(posed(method, points, sdf=grid), prior=prior)
+
+
+def turns_off(found):
+    """Angles (B,), radians, between the hypotheses and the true pose."""
+    return rotation_angle(found.object_from_world[:, :3, :3] @ TRUTH[:3, :3])
+
+
+def test_a_prior_on_an_axis_chooses_between_two_modes():
+    method = anchored()
+    for prior, modes in (
+        (None, [True, True]),
+        (PosePrior(axis=[1, 0, 0], along=TRUTH[:3, 0], axis_noise=0.3), [True, False]),
+        (PosePrior(axis=[1, 0, 0], along=-TRUTH[:3, 0], axis_noise=0.3), [False, True]),
+    ):
+        off = turns_off(method.register(knob_problem(method, prior)))
+        assert [(off < 0.1).any(), (off > np.pi - 0.1).any()] == modes
+
+
+def test_a_prior_of_poses_chooses_between_two_modes():
+    """A pose near the other one, off by 1 cm and 0.1 rad as it says."""
+    other = compose(axis_angle(TRUTH[:3, 2], np.pi + 0.1) @ TRUTH[:3, :3], TRUTH[:3, 3] + 0.006)
+    spread = np.diag([0.01**2] * 3 + [0.1**2] * 3)
+    prior = PosePrior(object_from_world=inverse(other)[None], covariances=spread)
+    method = anchored()
+    off = turns_off(method.register(knob_problem(method, prior)))
+    assert off[0] > np.pi - 0.1
+    assert (off > np.pi - 0.1).mean() > 0.9  # a prior may be wrong: so is one in e^7
+
+
+def test_points_overrule_a_prior_that_is_20_cm_off():
+    prior = PosePrior(centre=TRUTH[:3, 3] + [0.2, 0.0, 0.0], centre_noise=0.02, point=np.zeros(3))
+    method = anchored()
+    points = touched(np.random.default_rng(1).choice(400, 12, replace=False))
+    problem = replace(posed(method, points), prior=prior)
+    found = method.register(problem)
+    assert_found(found)
+    (warning,) = check_prior(problem, found)
+    assert warning.code == "prior"
+    assert "19." in warning.text or "20." in warning.text  # centimetres
+
+
+def test_poses_of_a_prior_are_searched_from():
+    """One that nothing else leads to: two samples are drawn, and E_0 is anywhere else."""
+    effort = replace(EFFORT, samples=2, kept=2, rounds=1, descents=2)
+    near = TRUTH @ compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.2)), np.full(3, 0.01))
+    spread = np.diag([0.02**2] * 3 + [0.3**2] * 3)
+    prior = PosePrior(object_from_world=inverse(near)[None], covariances=spread)
+    method = anchored(effort)
+    problem = posed(method, POINTS)
+    assert_found(method.register(replace(problem, prior=prior)))
+    energies = [method.register(replace(problem, prior=p)).cost[0] for p in (prior, None)]
+    assert energies[0] < energies[1] - 10.0
+
+
+def test_a_prior_is_on_the_pose_before_the_pushes_that_are_found():
+    """Five pushes by 4 mm along x, each after eight contacts: a prior on where it is now is off."""
+    pushed = TRUTH.copy()
+    pushed[0, 3] += 0.02
+    points = touched(slice(0, 48))
+    known = points.known + np.repeat(np.arange(6), 8)[:, None] * [0.004, 0.0, 0.0]
+    before = np.array([[0, 0, 8 * n] for n in range(1, 6)])
+    along = Pushes(np.tile([1.0, 0.0, 0.0], (5, 1)), before, largest=0.008)
+    method = anchored()
+    problem = replace(posed(method, replace(points, known=known)), pushes=along)
+    for truth, warned in ((TRUTH, False), (pushed, True)):
+        prior = PosePrior(centre=truth[:3, 3], centre_noise=0.002, point=np.zeros(3))
+        found = method.register(replace(problem, prior=prior))
+        assert found.push_distance == pytest.approx(0.004, abs=1e-4)
+        np.testing.assert_allclose(found.world_from_object[0], pushed, atol=2e-3)
+        assert bool(check_prior(replace(problem, prior=prior), found)) is warned

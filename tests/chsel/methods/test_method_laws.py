@@ -8,13 +8,14 @@ import pytest
 
 import chsel
 from chsel.cost.cost_settings import CostSettings
+from chsel.methods import METHODS
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import apply, compose, inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import settings_mapping
 from chsel.problem.streams import StreamKey
 from tests.chsel.laws import every_method, quick
-from tests.chsel.methods.scene import GRID, MESH, POINTS, SIDE, WORKSPACE, around_truth
+from tests.chsel.methods.scene import GRID, MESH, POINTS, SIDE, TRUTH, WORKSPACE, around_truth
 
 DRAWS_POSES = ("chsel", "chsel_cma_me", "medial_constraint", "medial_constraint_cma_me", "anchored")
 """Methods that draw poses in coordinates of the world, so that not all of them move with it."""
@@ -89,13 +90,66 @@ def test_the_order_of_points_does_not_matter(name, preset):
     assert_same(found, result(name, preset), all_of_them=not drawn)
 
 
+def with_normals(points, world_from_object=TRUTH):
+    """The points with the normals of the L at some pose; every fifth has none."""
+    gradients = GRID.at(apply(inverse(world_from_object), points.known), lookup="trilinear")[1]
+    normals = gradients / np.linalg.norm(gradients, axis=1, keepdims=True)
+    known = np.arange(len(normals)) % 5 > 0
+    return replace(
+        points,
+        normals=known[:, None] * normals @ world_from_object[:3, :3].T,
+        normal_noise=np.where(known, np.linspace(0.1, 0.3, len(known)), 0.0),
+    )
+
+
+def test_normals_turn_with_the_world_and_go_with_their_points():
+    """By any order and a quarter turn, of the best pose and its cost; draws end a little apart."""
+
+    def assert_alike(found):
+        poses = found.object_from_world[0], expected.object_from_world[0]
+        np.testing.assert_allclose(*poses, rtol=0, atol=1e-3)
+        assert found.cost[0] == pytest.approx(expected.cost[0], abs=0.1)
+
+    few = with_normals(FEW.with_known(slice(12)))
+    problem = replace(PROBLEM, points=replace(few, free=FEW.free[:0]))
+    expected = quick("anchored").register(problem)
+    order = np.random.default_rng(0).permutation(12)
+    permuted = replace(problem, points=problem.points.with_known(order))
+    assert_alike(quick("anchored").register(permuted))
+    normals = {"normals": few.normals[order], "normal_noise": few.normal_noise[order]}
+    mixed = replace(problem, points=replace(problem.points, **normals))
+    assert quick("anchored").register(mixed).cost[0] > expected.cost[0] + 10.0
+    turn = compose(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+    corners = apply(turn, np.array(WORKSPACE.bounds))
+    points = KnownPoints(
+        known=apply(turn, few.known),
+        normals=few.normals @ turn[:3, :3].T,
+        normal_noise=few.normal_noise,
+    )
+    moved = replace(
+        problem,
+        points=points,
+        initial_set=PROBLEM.initial_set @ inverse(turn),
+        workspace=Workspace(tuple(corners.min(axis=0)), tuple(corners.max(axis=0))),
+    )
+    found = quick("anchored").register(moved)
+    assert_alike(replace(found, object_from_world=found.object_from_world @ turn))
+
+
+@pytest.mark.parametrize("name", [name for name in METHODS if name != "anchored"])
+def test_other_methods_read_neither_normals_nor_a_prior(name):
+    prior = chsel.PosePrior(centre=[0.1, 0.1, 0.1], centre_noise=0.001)
+    problem = replace(PROBLEM, points=with_normals(FEW), prior=prior)
+    assert quick(name).register(problem).digest == result(name, "default").digest
+
+
 @every_method
 def test_contacts_that_count_twice_are_those_of_twice_the_weight(name, preset):
     """Costs that are means, or matches of each contact, stay as they are.
 
     `cvo` compares whole clouds, in which free points then weigh half as much.
     """
-    points = replace(FEW, known=np.repeat(FEW.known, 2, axis=0), known_sdf=None)
+    points = FEW.with_known(np.repeat(np.arange(len(FEW.known)), 2))
     method = quick(name, preset)
     found = method.register(replace(PROBLEM, points=points))
     cost = getattr(method.settings, "cost", None)

@@ -1,6 +1,7 @@
 """Sessions of a robot's own program: what is added, registered, chosen, recorded and refused."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from scipy.spatial import cKDTree
 import chsel
 from chsel.methods.anchored.anchored import Anchored
 from chsel.problem.poses import apply, axis_angle, compose, inverse
+from replay.__main__ import main
 from replay.comparing.verification import EQUAL, verify
 from replay.mcap.reader import read_recording
 from tests.chsel.samples import box_distance
@@ -92,6 +94,27 @@ def test_normals_reach_the_problem_the_recording_and_its_reader(tmp_path):
     np.testing.assert_array_equal(shown[1], [*-NORMALS[3:8], NORMALS[8]])
     np.testing.assert_array_equal(shown[2], [*NORMALS[9:11], np.zeros(3)])
     assert not shown[3].any()
+
+
+def test_recordings_with_normals_and_a_prior_replay_to_the_bit_and_compare(tmp_path, capsys):
+    path = tmp_path / "touches.mcap"
+    prior = chsel.PosePrior(centre=TRUTH[:3, 3], centre_noise=0.02, point=np.zeros(3))
+    with chsel.Session(BOX, record=path, prior=prior) as session:
+        for part in (slice(0, 4), slice(4, 8)):
+            session.add(contacts=CONTACTS[part], normals=NORMALS[part])
+            found = session.register()
+    recording = read_recording(path)
+    assert [verdict.outcome for verdict in verify(recording)] == [EQUAL] * 2
+    assert recording.hypotheses(1).digest == found.digest
+    assert main(["step", str(path), "--step", "1"]) == 0
+    assert main(["compare", str(path), "--methods", "anchored", "icp"]) == 0
+    out = capsys.readouterr().out
+    assert "anchored has the recorded settings: its 2 results are those recorded, to the bit" in out
+    problem = recording.problem(1)
+    bare = replace(problem, points=problem.points.without_normals(), prior=None)
+    alike = [chsel.build_method("icp").register(each).digest for each in (problem, bare)]
+    assert alike[0] == alike[1]
+    assert chsel.build_method("anchored").register(bare).digest != found.digest
 
 
 def test_a_push_carries_points_and_keeps_their_normals():
