@@ -111,7 +111,8 @@ def check_normals(
     every = Poses.joined(poses)
     energies = pose_energies(flipped, every, noise=model)
     least = pose_energies(problem, every, noise=model).min()
-    there = every[np.argmin(energies)[None]]
+    at = int(np.argmin(energies))
+    there = every[at : at + 1]
     cosines = posed_normals(sdf, points, poses=there).cosines[0][known]
     inward = int((cosines < _INWARD).sum())
     if inward <= (cosines > -_INWARD).sum() or energies.min() > least - _BETTER:
