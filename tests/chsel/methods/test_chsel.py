@@ -8,6 +8,7 @@ import pytest
 from chsel.methods import chsel
 from chsel.methods.chsel import Chsel, ChselSettings
 from chsel.methods.gradient_descent import DescentSettings
+from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, inverse
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.search_space import SE3Space
@@ -86,9 +87,7 @@ def test_estimates_and_elites_outside_of_the_workspace_are_left_out():
     """A contact 3 m away has its best poses there."""
     away = np.eye(4)
     away[:3, 3] = 3.0
-    points = replace(
-        POINTS, known=np.concatenate([POINTS.known, POINTS.known + 3.0]), known_sdf=None
-    )
+    points = POINTS.merged(KnownPoints(known=POINTS.known + 3.0))
     initial = np.concatenate([around_truth(4), inverse(away @ inverse(around_truth(4)))])
     for margin, leaves in ((0.15, 0), (None, 1)):
         method = Chsel(replace(QUICK, output=OutputSettings(margin=margin), starts=None))

@@ -106,7 +106,7 @@ def test_recordings_with_normals_and_a_prior_replay_to_the_bit_and_compare(tmp_p
     recording = read_recording(path)
     assert [verdict.outcome for verdict in verify(recording)] == [EQUAL] * 2
     assert recording.hypotheses(1).digest == found.digest
-    assert main(["step", str(path), "--step", "1"]) == 0
+    assert main(["step", str(path), "--step", "1", "-o", str(tmp_path / "step.mcap")]) == 0
     assert main(["compare", str(path), "--methods", "anchored", "icp"]) == 0
     out = capsys.readouterr().out
     assert "anchored has the recorded settings: its 2 results are those recorded, to the bit" in out
