@@ -3,8 +3,9 @@
     E(X) = -log((1 - w) exp(-q(X)) + w),    w = exp(-WRONG)
     q(X) = |R c + t - p|^2 / (2 s_c^2)  +  2 (1 - (R l) . a) / s_a^2  -  log min(sum_j g_j(X), 1)
 
-in nats: 0 where the prior has the object, and at most WRONG, since one prior in exp(WRONG) is wrong
-and its object can be anywhere. A world point c is the object's point p, a world direction l is the
+in nats: 0 where the prior has the object, and at most WRONG, so that points which contradict it
+decide where the object is. WRONG is more than the LIMIT of `chsel.problem.noise`, or sets would be
+full of poses that ignore the prior. A world point c is the object's point p, a world direction l is the
 object's axis a, and g_j are Gaussians about the poses of another estimator, in units of the highest
 that their sum is at one of these poses.
 """
@@ -29,7 +30,6 @@ from chsel.errors import (
 )
 from chsel.numerics.arrays import FloatArray, ShapesShown, digest, frozen
 from chsel.numerics.elementary import arctangents, exps, logs
-from chsel.problem.noise import WRONG
 from chsel.problem.points import FARTHEST_PLACE
 from chsel.problem.poses import (
     Poses,
@@ -42,6 +42,7 @@ from chsel.problem.poses import (
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.surface import has_surface, in_order, object_centre
 
+WRONG = 12.0  # nats
 LEAST_NOISE = 1e-9  # metres or radians: less is taken for a mistake
 MOST_POSES = 200  # of another estimator: every energy looks at all of them
 SURE = 5.0  # nats beyond the mean cost of a right prior, above which the points contradict it

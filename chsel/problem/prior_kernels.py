@@ -11,8 +11,7 @@ from chsel.numerics.cell_set import triple
 from chsel.numerics.compiler import inner, leaf
 from chsel.numerics.elementary import arctangent, exp, exps, log, sine_cosine
 from chsel.numerics.pose_tuples import moved, pose_at, turned, turned_back
-from chsel.problem.noise import WRONG
-from chsel.problem.pose_prior import PosePrior, centre_of
+from chsel.problem.pose_prior import WRONG, PosePrior, centre_of
 from chsel.problem.poses import Poses
 from chsel.problem.sdf_grid import SdfGrid
 

@@ -9,9 +9,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 from chsel.errors import PoseError, SettingError
-from chsel.problem.noise import WRONG
 from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.pose_prior import PosePrior, centre_of, prior_from_settings
+from chsel.problem.pose_prior import WRONG, PosePrior, centre_of, prior_from_settings
 from chsel.problem.poses import Poses, axis_angle, compose, inverse, rotation_vector
 from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, check_prior
