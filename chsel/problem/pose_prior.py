@@ -5,9 +5,9 @@
 
 in nats: 0 where the prior has the object, and at most WRONG, so that points which contradict it
 decide where the object is. WRONG is more than the LIMIT of `chsel.problem.noise`, or sets would be
-full of poses that ignore the prior. A world point c is the object's point p, a world direction l is the
-object's axis a, and g_j are Gaussians about the poses of another estimator, in units of the highest
-that their sum is at one of these poses.
+full of poses that ignore the prior. A world point c is the object's point p, a world direction l is
+the object's axis a, and g_j are Gaussians about the poses of another estimator, in units of the
+highest that their sum is at one of these poses.
 """
 
 from __future__ import annotations
