@@ -142,7 +142,6 @@ def write_accepted(recording: Recording, path: Path) -> list[ResultChange]:
                 seconds[event.step] = Timed(event.step, event.seconds)
                 for inner in event.computed or event.recorded:
                     recorder.record(inner)
-                recorder.flush()
                 continue
             if tells_loss(event):
                 raise RecordingError(

@@ -17,6 +17,7 @@ from chsel.next_probe.forecast import (
     surprise,
 )
 from chsel.policies import POLICIES, build_policy
+from chsel.problem.noise import FACET
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, axis_angle, compose
 from chsel.problem.registration_problem import Hypotheses
@@ -143,7 +144,7 @@ def test_gains_are_those_of_the_formulas(seed, count, reach, points):
         gradients = problem.sdf.at(places.reshape(-1, 3), lookup="trilinear")[1]
         lengths = np.sqrt((gradients**2).sum(axis=1))
         units = (gradients / lengths[:, None]).reshape(places.shape)
-        spread = (0.5 * 0.2**2 + 0.05**2 + 1.0 - lengths).reshape(hit.shape)
+        spread = (0.5 * 0.2**2 + FACET**2 + 1.0 - lengths).reshape(hit.shape)
         near *= normal_overlap(np.einsum("iac,jac->ija", units, units), spread[:, None], spread)
     alike = np.where(both, near, np.where(neither, 1.0, 0.01))
     with np.errstate(divide="ignore"):

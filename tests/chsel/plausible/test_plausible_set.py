@@ -277,8 +277,7 @@ SETTINGS = PlausibleSettings(
 def made():
     problem, truth = scene(np.random.default_rng(1), ball())
     contact = apply(truth, np.array([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]))
-    points = replace(problem.points, free=np.zeros((0, 3)), known=contact, known_sdf=None)
-    problem = replace(problem, points=replace(points, occupied=np.zeros((0, 3))))
+    problem = replace(problem, points=KnownPoints(known=contact))
     return problem, truth, plausible_set(problem, truth, settings=SETTINGS)
 
 
