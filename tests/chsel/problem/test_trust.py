@@ -330,7 +330,7 @@ def test_poses_within_the_noise_are_one_mode():
 @pytest.mark.usefixtures("held")
 def test_poses_that_leave_out_one_of_few_contacts_are_rivals():
     """A box slid until one contact is in the air, and off the others by as much as is allowed."""
-    side = [[0.05, y, z] for y in (-0.02, 0.0, 0.02) for z in (-0.04, 0.04)]
+    side = [[0.05, y, z] for y in np.linspace(-0.02, 0.02, 4) for z in np.linspace(-0.04, 0.04, 4)]
     known = np.array([*side, [0.02, 0.03, -0.03], [0.0, 0.0, 0.08], [-0.02, 0.03, 0.03]])
     assert len(known) == MANY_CONTACTS - 1
     slid = np.array([moved(x=x, z=0.03) for x in np.arange(0.0, 0.005, 0.0001)])
