@@ -30,7 +30,7 @@ class FakeRobot:
 
 if __name__ == "__main__":
     robot = FakeRobot(chsel.load_mesh(MUSTARD), TRUTH)
-    policy = chsel.build_policy("information", {"stop": {"spread": 0.004}})
+    policy = chsel.build_policy("information", {"stop": {"spread": 0.004, "gain": 0.0}})
     with chsel.Session(MUSTARD, hand=FINGER, workspace=TABLE, policy=policy) as session:
         while (probe := session.next_probe()) is not None:
             path, contact = robot.touch(probe.world_from_hand, probe.length)
