@@ -363,8 +363,9 @@ def _in_32_bits(values: Any) -> Any:
 
 
 def _coarse_gradients(sdf: SdfGrid) -> Any:
-    """Return gradients at nodes, flat, 8 bits."""
-    return np.rint(_GRADIENT * sdf.gradients).astype(np.int8).reshape(-1)
+    """Return gradients at nodes, flat, 8 bits; those of a user's grid may be longer than 1."""
+    units = np.rint(_GRADIENT * sdf.gradients)
+    return np.clip(units, -_GRADIENT, _GRADIENT).astype(np.int8).reshape(-1)
 
 
 def _in_units(metres: FloatArray) -> Any:

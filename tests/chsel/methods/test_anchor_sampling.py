@@ -11,6 +11,7 @@ from chsel.methods.anchor_sampling import (
     AnchoredStarts,
     AnchorSampler,
     AnchorSettings,
+    _coarse_gradients,
     anchored_starts,
     most_informative_first,
 )
@@ -19,6 +20,7 @@ from chsel.numerics.elementary import sines_cosines_of_turns
 from chsel.numerics.threads import threads
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, compose, inverse
+from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
 from chsel.problem.surface import has_surface
 from tests.chsel.methods.scene import BOX, BOX_GRID, WORKSPACE, Watcher, box_problem, contacts_on
@@ -244,3 +246,12 @@ def test_default_finds_what_e_0_is_too_far_from(name):
     assert len(found.cost) == len(FAR)
     alone = Chsel(replace(quick, starts=None)).register(problem)
     assert found.cost[0] < 0.5 * alone.cost[0]
+
+
+def test_gradients_longer_than_one_keep_their_signs_in_coarse_scores():
+    """A grid of one's own may have distances that are scaled."""
+    count = (3, 3, 3)
+    gradients = np.broadcast_to([1.1, -1.1, 0.5], (*count, 3))
+    grid = SdfGrid(np.zeros(3), 0.01, values=np.full(count, 0.01), gradients=gradients)
+    rows = _coarse_gradients(grid).reshape(-1, 3)
+    np.testing.assert_array_equal(rows, np.tile([127, -127, 64], (27, 1)))
