@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import permutations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,9 +19,11 @@ from chsel.problem.streams import Purpose, StreamKey
 
 _CENTRE_POINTS = 1000
 _LOOKUPS_PER_THREAD = 6400  # fewer are done before another thread wakes up
-# The six tetrahedra of a cell, along its diagonal (Freudenthal, 1942): corners (6, 4, 3).
+_PART = 1000  # cells that are cut at once
+_CORNERS = np.array(list(np.ndindex(2, 2, 2)))  # (8, 3) of a cell
+# The six tetrahedra of a cell, along its diagonal (Freudenthal, 1942): corners (6, 4), by number.
 _TETRAHEDRA = np.array(
-    [np.cumsum([(0, 0, 0), *np.eye(3, dtype=np.int64)[list(p)]], 0) for p in permutations(range(3))]
+    [np.cumsum([0, *np.array([4, 2, 1])[list(p)]]) for p in permutations(range(3))]
 )
 # Edges that the surface crosses, by the number of corners inside, when these are numbered first.
 _TRIANGLES = {
@@ -29,6 +31,32 @@ _TRIANGLES = {
     2: (((0, 2), (0, 3), (1, 3)), ((0, 2), (1, 3), (1, 2))),
     3: (((0, 3), (1, 3), (2, 3)),),
 }
+
+
+def _crossed_edges() -> IntArray:
+    """Return the corners (3, 2, 192) of a cell at both ends of a triangle's three crossed edges.
+
+    192: by tetrahedron (6), its corners inside as bits (16), and which of up to two triangles.
+    """
+    edges = np.zeros((6, 16, 2, 3, 2), dtype=np.int64)
+    for bits in range(1, 15):
+        inside = [bits >> corner & 1 for corner in range(4)]
+        order = np.argsort(np.logical_not(inside), kind="stable")
+        for t, triangle in enumerate(_TRIANGLES[sum(inside)]):
+            edges[:, bits, t] = _TETRAHEDRA[:, order[np.array(triangle)]]
+    return np.moveaxis(edges.reshape(-1, 3, 2), 0, -1)
+
+
+_CROSSED = _crossed_edges()
+_INSIDE = np.array([bits.bit_count() for bits in range(16)])  # corners
+
+
+class ZeroLevel(NamedTuple):
+    """Triangles of the surface of a grid, those in tetrahedra with one corner inside first."""
+
+    cells: IntArray  # (T,) first node of each triangle's cell, by number
+    edges: IntArray  # (T,) which of _CROSSED its corners are on, by number
+    reached: FloatArray  # (T,) area up to the end of each, square metres
 
 
 def surface_points(sdf: SdfGrid, count: int, *, stream: np.random.Generator) -> FloatArray:
@@ -39,22 +67,20 @@ def surface_points(sdf: SdfGrid, count: int, *, stream: np.random.Generator) -> 
     than the resolution, and parts thinner than the resolution may be missing.
     Raises SdfError if no node is inside of the object.
     """
-    triangles = sdf.derived("surface", lambda: _zero_level(sdf))
-    if len(triangles) == 0:
+    level = sdf.derived("surface", lambda: _zero_level(sdf))
+    reached = level.reached
+    if len(reached) == 0:
         raise SdfError(
             "no node of the SDF grid is inside of the object; accepted: a resolution fine enough "
             "for one"
         )
-    corner = triangles[:, 0]
-    u, v = triangles[:, 1] - corner, triangles[:, 2] - corner
-    area = np.sqrt((np.cross(u, v) ** 2).sum(axis=1))
-    reached = np.cumsum(area)
     chosen, root, share = stream.random((count, 3)).T
     index = np.searchsorted(reached, chosen * reached[-1], side="right")
-    index = np.minimum(index, len(area) - 1)
+    index = np.minimum(index, len(reached) - 1)
+    corner, u, v = _triangles(sdf, level.cells[index], edges=level.edges[index])
     root = np.sqrt(root)[:, None]
     share = root * share[:, None]
-    return _refined(sdf, corner[index] + (root - share) * u[index] + share * v[index])
+    return _refined(sdf, corner + (root - share) * u + share * v)
 
 
 def has_surface(sdf: SdfGrid) -> bool:
@@ -96,42 +122,48 @@ def _refined(sdf: SdfGrid, points: FloatArray) -> FloatArray:
     return points - (step / np.maximum(size, 0.1))[:, None] * normal  # less if gradients cancel
 
 
-def _zero_level(sdf: SdfGrid) -> FloatArray:
-    """Return triangles (T, 3, 3) of the surface, in the order of the cells."""
+def _zero_level(sdf: SdfGrid) -> ZeroLevel:
+    """Return the triangles of the surface, by the corners inside, in the order of the cells."""
     inside = sdf.values < 0.0
     nx, ny, nz = sdf.shape
-    offsets = list(np.ndindex(2, 2, 2))
-    corners = [inside[i : nx - 1 + i, j : ny - 1 + j, k : nz - 1 + k] for i, j, k in offsets]
+    corners = [inside[i : nx - 1 + i, j : ny - 1 + j, k : nz - 1 + k] for i, j, k in _CORNERS]
     crossed = np.logical_or.reduce(corners) & ~np.logical_and.reduce(corners)
-    nodes = np.argwhere(crossed)[:, None, None] + _TETRAHEDRA  # (cells, 6, 4, 3)
-    return np.concatenate(
-        [
-            _triangles(sdf, nodes.reshape(-1, 4, 3), inside=n, triangles=edges)
-            for n, edges in _TRIANGLES.items()
-        ]
-    )
+    cells = np.ravel_multi_index(np.nonzero(crossed), sdf.shape)
+    parts: dict[int, list[tuple[IntArray, ...]]] = {count: [] for count in _TRIANGLES}
+    for first in range(0, len(cells) or 1, _PART):
+        part = cells[first : first + _PART]
+        of_corners = inside.ravel()[part[:, None] + _after(sdf)][:, _TETRAHEDRA]
+        bits = (of_corners * [1, 2, 4, 8]).sum(axis=2)  # (cells, 6)
+        for count, triangles in _TRIANGLES.items():
+            where, tetrahedron = np.nonzero(_INSIDE[bits] == count)
+            numbers = 2 * (16 * tetrahedron + bits[where, tetrahedron])
+            of_cell = part[where].repeat(len(triangles))
+            edges = (numbers[:, None] + np.arange(len(triangles))).ravel()
+            _, u, v = _triangles(sdf, of_cell, edges=edges)
+            area = np.sqrt((np.cross(u, v) ** 2).sum(axis=1))
+            parts[count].append((of_cell.astype(np.int32), edges.astype(np.uint8), area))
+    columns = zip(*(part for of_count in parts.values() for part in of_count), strict=True)
+    of_cell, edges, area = map(np.concatenate, columns)
+    return ZeroLevel(of_cell, edges=edges, reached=np.cumsum(area))
 
 
 def _triangles(
-    sdf: SdfGrid,
-    nodes: IntArray,
-    *,
-    inside: int,
-    triangles: tuple[tuple[tuple[int, int], ...], ...],
-) -> FloatArray:
-    """Return triangles (T, 3, 3) in the tetrahedra (P, 4, 3) that have `inside` corners inside."""
-    values = sdf.values[nodes[..., 0], nodes[..., 1], nodes[..., 2]]
-    chosen = (values < 0.0).sum(axis=1) == inside
-    nodes, values = nodes[chosen], values[chosen]
-    order = np.argsort(values >= 0.0, axis=1, kind="stable")
-    values = np.take_along_axis(values, order, axis=1)
-    places = sdf.origin + np.take_along_axis(nodes, order[..., None], axis=1) * sdf.resolution
-    corners = np.empty((len(nodes), len(triangles), 3, 3))
-    for t, edges in enumerate(triangles):
-        for e, (a, b) in enumerate(edges):
-            share = values[:, a] / (values[:, a] - values[:, b])
-            corners[:, t, e] = places[:, a] + share[:, None] * (places[:, b] - places[:, a])
-    return corners.reshape(-1, 3, 3)
+    sdf: SdfGrid, cells: IntArray, *, edges: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a corner (T, 3) of triangles, and the ways (T, 3) from it to the others."""
+    ends = _CROSSED[..., edges]  # (3, 2, T)
+    values = sdf.values.ravel()[cells + _after(sdf)[ends]]
+    nodes = np.array(np.unravel_index(cells, sdf.shape))[:, None, None] + _CORNERS.T[:, ends]
+    places = sdf.origin[:, None, None, None] + nodes * sdf.resolution  # (3, 3, 2, T)
+    share = values[:, 0] / (values[:, 0] - values[:, 1])
+    corners = places[:, :, 0] + share * (places[:, :, 1] - places[:, :, 0])  # (3, 3, T)
+    first, second, third = np.moveaxis(corners, 0, -1)
+    return first, second - first, third - first
+
+
+def _after(sdf: SdfGrid) -> IntArray:
+    """Return numbers of nodes (8,) from a cell's first one to its corners."""
+    return np.ravel_multi_index(tuple(_CORNERS.T), sdf.shape)
 
 
 _POINTS = 100
