@@ -27,6 +27,33 @@ from chsel.numerics.compiler import compiled
 def near(x):
     return 2.0 * far(x)
 """,
+    "line.py": """
+from chsel.numerics.compiler import compiled
+def height(model, x):
+    raise NotImplementedError
+@compiled
+def twice(model, x):
+    return height(model, x) + height(model, x) + model.offset
+""",
+    "models.py": """
+from typing import NamedTuple
+from chsel.line import height
+from chsel.numerics.compiler import implements
+class Slope(NamedTuple):
+    factor: float
+    offset: float
+@implements(height, Slope)
+def _height(model, x):
+    return model.factor * x
+""",
+    "third.py": """
+from chsel.line import height
+from chsel.models import Slope
+from chsel.numerics.compiler import implements
+@implements(height, Slope)
+def _other(model, x):
+    return 0.0
+""",
 }
 CHANGE = """
 import sys
@@ -39,6 +66,11 @@ file.write_text(file.read_text().replace(old, new))
 NEAR = """
 from chsel.near import near
 print(near(1.0), sum(near.stats.cache_misses.values()))
+"""
+LINE = """
+from chsel.line import twice
+from chsel.models import Slope
+print(twice(Slope(3.0, 1.0), 1.0), sum(twice.stats.cache_misses.values()))
 """
 
 
@@ -56,27 +88,53 @@ def result_of(process):
     return out, errors
 
 
-def test_a_kernel_is_compiled_again_if_anything_that_it_contains_has_changed(tmp_path):
+@pytest.fixture
+def printed(tmp_path):
+    """What code prints that runs in a copy of the package with the planted files."""
     shutil.copytree(ROOT / "chsel", tmp_path / "chsel", ignore=shutil.ignore_patterns("__py*"))
     for name, text in PLANTED.items():
         (tmp_path / "chsel" / name).write_text(text)
 
-    def near(code, *words):
+    def numbers(code, *words):
         process = start(code, *words, root=tmp_path, CHSEL_CACHE_DIR=str(tmp_path / "kept"))
         return [float(word) for word in result_of(process)[0].split()]
 
-    assert near(NEAR) == [4.0, 1.0]
-    assert near(NEAR) == [4.0, 0.0]
-    assert near(CHANGE + NEAR, "far.py", "x +", "x -") == [0.0, 1.0]  # while it runs: not kept
-    assert near(NEAR) == [0.0, 1.0]
+    return numbers
+
+
+def test_a_kernel_is_compiled_again_if_anything_that_it_contains_has_changed(printed, tmp_path):
+    assert printed(NEAR) == [4.0, 1.0]
+    assert printed(NEAR) == [4.0, 0.0]
+    assert printed(CHANGE + NEAR, "far.py", "x +", "x -") == [0.0, 1.0]  # while it runs: not kept
+    assert printed(NEAR) == [0.0, 1.0]
     constant = tmp_path / "chsel" / "constant.py"
     constant.write_text("STEP = 2.0\n")
-    assert near(NEAR) == [-2.0, 1.0]
+    assert printed(NEAR) == [-2.0, 1.0]
     constant.write_text("STEP = 1.0\n")
-    assert near(NEAR) == [0.0, 0.0]
-    session = tmp_path / "chsel" / "session" / "session.py"  # no kernel imports it
-    session.write_text(session.read_text() + "EDITED = True\n")
-    assert near(NEAR) == [0.0, 0.0]
+    assert printed(NEAR) == [0.0, 0.0]
+    for name in ("session/session.py", "line.py", "cost/cost_kernels.py"):  # near imports none
+        file = tmp_path / "chsel" / name
+        file.write_text(file.read_text() + "EDITED = True\n")
+    assert printed(NEAR) == [0.0, 0.0]
+
+
+def test_a_kernel_is_compiled_again_if_a_file_of_its_arguments_has_changed(printed, tmp_path):
+    assert printed(LINE) == [7.0, 1.0]
+    assert printed(LINE) == [7.0, 0.0]
+    models = tmp_path / "chsel" / "models.py"
+    text = models.read_text()
+    models.write_text(text.replace("factor * x", "factor * x + 1.0"))
+    assert printed(LINE) == [9.0, 1.0]
+    models.write_text(text.replace("factor:", "swap:").replace("offset:", "factor:"))
+    models.write_text(models.read_text().replace("swap:", "offset:"))
+    assert printed(LINE) == [5.0, 1.0]  # factor 1, offset 3
+
+
+def test_what_implements_a_name_in_a_third_file_is_refused(printed):
+    with pytest.raises(
+        AssertionError, match=r"third._other is in another file than height and Slo"
+    ):
+        printed("import chsel.third")
 
 
 def test_a_folder_that_others_can_write_to_is_refused(tmp_path, monkeypatch):
