@@ -10,8 +10,6 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
-from scipy.spatial import cKDTree
 
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.elementary import arctangents
@@ -172,6 +170,8 @@ class RotatedSurface:
 
     def coarse_errors(self, turns: FloatArray, count: int = 128) -> FloatArray:
         """Return mean distances (T,) of rotated points from the surface by a grid, in diameters."""
+        from scipy.ndimage import distance_transform_edt
+
         empty = np.ones((_CELLS, _CELLS, _CELLS), dtype=bool)
         empty[_cells(self._points)] = False
         distance = distance_transform_edt(empty) / _CELLS
@@ -268,6 +268,8 @@ def _spread() -> tuple[FloatArray, IntArray]:
 
     Alexa, 2022, "Super-Fibonacci spirals: fast, low-discrepancy sampling of SO(3)".
     """
+    from scipy.spatial import cKDTree
+
     at = np.arange(_SPREAD) + 0.5
     inner = np.sqrt(at / _SPREAD)
     outer = np.sqrt(1.0 - at / _SPREAD)

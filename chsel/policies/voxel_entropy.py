@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 
 from chsel.next_probe.decision_problem import DecisionProblem, HandFront
 from chsel.next_probe.first_contact import moves_by_orientation, touched_points
@@ -118,6 +117,8 @@ def filled_points(sdf: SdfGrid, side: float) -> FloatArray:
 
 def _widened(front: HandFront, side: float) -> HandFront:
     """Return the front of a hand that sweeps every voxel of which it touches the square ahead."""
+    from scipy.ndimage import maximum_filter
+
     margin = min(int(0.5 * side / front.cell), _WIDEST)
     heights = np.pad(front.heights, margin, constant_values=-np.inf)
     heights = maximum_filter(heights, 2 * margin + 1, mode="constant", cval=-np.inf)

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from chsel.errors import PointsError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -51,6 +50,8 @@ def smooth(image: FloatArray, side: int) -> FloatArray:
     An even side reaches one pixel further up and left than down and right. Values that are not
     finite count as 0; otherwise they would spread over their row and column.
     """
+    from scipy.ndimage import uniform_filter
+
     require_positive("side of the filter", side)
     image = np.asarray(image, np.float64)
     return uniform_filter(np.where(np.isfinite(image), image, 0.0), size=side, mode="reflect")

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from math import sqrt
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import Workspace
@@ -32,6 +31,8 @@ class FreeMap:
         Left out are those less than a voxel's diagonal from contacts with a rigid hand, and behind
         them by `contact_normals`: the hand passed such a voxel, but not its centre.
         """
+        from scipy.spatial import cKDTree
+
         centres = self.grid.new()
         if contacts is None or len(contacts) == 0 or len(centres) == 0:
             return centres

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.points import Lattice
@@ -183,6 +182,8 @@ def neighbour_normals(
     Those of the planes of least squares through all points up to `reach` away, metres; 0 where
     these are fewer than 5, on a line, on no plane, or on one that is seen from beside it.
     """
+    from scipy.spatial import cKDTree
+
     normals = np.zeros((len(chosen), 3))
     if len(chosen) == 0:
         return normals

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from scipy.ndimage import binary_erosion
 
 from chsel.errors import ChselError, SessionError, SettingError
 from chsel.numerics.arrays import BoolArray, FloatArray
@@ -217,6 +216,8 @@ def _surface_pixels(
 
     Of these, those in regions that can be the object's; the others are counted by reason.
     """
+    from scipy.ndimage import binary_erosion
+
     square = np.ones((3, 3), dtype=bool)
     valid = view.valid
     within = binary_erosion(label, square, iterations=LABEL_MARGIN, border_value=1)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Lattice
@@ -14,6 +14,9 @@ from runners.sessions.gripper import START, Touch
 from runners.sessions.mesh_surface import MeshSurface
 from runners.sessions.probing_hand import ProbingHand, turned_from_forward
 from runners.sessions.probing_settings import ProbingSettings
+
+if TYPE_CHECKING:
+    import trimesh
 
 SPACING = 0.001  # m: of the points on the hand that can touch
 PATCH = 0.010  # m: side of the patches of these points that are passed over as one

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import igl
+from typing import TYPE_CHECKING
+
 import numpy as np
-import trimesh
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
+
+if TYPE_CHECKING:
+    import trimesh
 
 _SAME = (
     1e-4  # m: faces that are no farther from a point than this beyond the nearest one meet there
@@ -22,6 +25,8 @@ class MeshSurface:
     """
 
     def __init__(self, mesh: trimesh.Trimesh, world_from_object: FloatArray) -> None:
+        import igl
+
         self._vertices = np.ascontiguousarray(apply(world_from_object, np.asarray(mesh.vertices)))
         self._faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
         self._tree = igl.AABB()
@@ -43,6 +48,8 @@ class MeshSurface:
         A normal is that of the face with the nearest point; on an edge or a corner, of one of its
         faces.
         """
+        import trimesh
+
         squared, face, nearest = self._tree.squared_distance(self._vertices, self._faces, points)
         triangles = self._vertices[self._faces[face]]
         weights = trimesh.triangles.points_to_barycentric(triangles, nearest)
@@ -62,6 +69,8 @@ class MeshSurface:
 
         Where faces meet, it is that of the one that faces most along a direction (3,).
         """
+        import trimesh
+
         triangles = self._vertices[self._faces]
         points = np.broadcast_to(point, (len(triangles), 3))
         nearest = trimesh.triangles.closest_point(triangles, points)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import trimesh
-from scipy.spatial import ConvexHull, QhullError
 
 from chsel.errors import SessionError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, axis_angle, compose, roll_pitch_yaw
 from runners.sessions.configurations import MESH_YAW, Configuration
+
+if TYPE_CHECKING:
+    import trimesh
 
 _FLAT = 1e-6  # m: vertices lower than this touch the floor
 _MOST_ROLLS = 1000
@@ -91,6 +94,8 @@ def _tilt(placed: FloatArray, pivot: FloatArray, *, away: FloatArray) -> FloatAr
 
 def _nearest_support(support: FloatArray, point: FloatArray) -> FloatArray:
     """Return the point (2,) nearest to `point` of the polygon of touching vertices (S, 2)."""
+    from scipy.spatial import ConvexHull, QhullError
+
     try:
         hull = ConvexHull(support)
         corners = support[hull.vertices]

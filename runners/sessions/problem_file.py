@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
@@ -27,6 +26,9 @@ from runners.objects.loader import ObjectConfig, load_object
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
 from runners.sessions import open_source, session_settings
 from runners.sessions.source import ProbeSource
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,11 +5,9 @@ from __future__ import annotations
 import tempfile
 from collections import deque
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import trimesh
-from scipy.spatial.transform import Rotation
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse
@@ -21,6 +19,9 @@ from runners.sessions.physics_engine import connect, silent
 from runners.sessions.placement import centre_of_mass, laid_down, lowest, on_stand
 from runners.sessions.probing_hand import ProbingHand, turned_from_forward
 from runners.sessions.probing_settings import ProbingSettings
+
+if TYPE_CHECKING:
+    import trimesh
 
 TIME_STEP = 1.0 / 240.0  # s
 GRAVITY = -10.0  # m/s^2
@@ -109,6 +110,8 @@ class PyBulletEngine:
 
     def place(self, pose: FloatArray) -> bool:
         """Put the hand at a pose (4, 4); False, and not to be used, if the object is there."""
+        from scipy.spatial.transform import Rotation
+
         world = self._world
         position = pose[:3, 3].tolist()
         quaternion = Rotation.from_matrix(turned_from_forward(pose[:3, :3])).as_quat().tolist()
@@ -234,6 +237,8 @@ def _hand(world: Any, hand: ProbingHand, *, folder: Path) -> int:
 
 def _placed(pose: FloatArray) -> dict[str, list[float]]:
     """Return arguments of createMultiBody that put a body at a pose (4, 4)."""
+    from scipy.spatial.transform import Rotation
+
     quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
     return {"basePosition": pose[:3, 3].tolist(), "baseOrientation": quaternion.tolist()}
 
