@@ -69,13 +69,7 @@ def compiled(function: Function) -> Function:
 
 
 class _Part(JITCodeLibrary):
-    """Code of a function that is only ever a part of others: their machine code has it.
-
-    It is optimised there, too. Numba does both for every function, and again for what it calls.
-    """
-
-    def _optimize_final_module(self) -> None:
-        """Leave the code as it is linked into that of callers."""
+    """Code of a function that is only ever a part of others: their machine code has it."""
 
     def _finalize_final_module(self) -> None:
         """Make the pointers to environments alone, which numba sets in memory."""
