@@ -48,7 +48,7 @@ def _crossed_edges() -> IntArray:
 
 
 _CROSSED = _crossed_edges()
-_INSIDE = np.array([bits.bit_count() for bits in range(16)])  # corners
+_INSIDE = np.array([bits.bit_count() for bits in range(16)])  # corners, by their bits
 
 
 class ZeroLevel(NamedTuple):
@@ -56,7 +56,7 @@ class ZeroLevel(NamedTuple):
 
     cells: IntArray  # (T,) first node of each triangle's cell, by number
     edges: IntArray  # (T,) which of _CROSSED its corners are on, by number
-    reached: FloatArray  # (T,) area up to the end of each, square metres
+    reached: FloatArray  # (T,) twice the area up to the end of each, square metres
 
 
 def surface_points(sdf: SdfGrid, count: int, *, stream: np.random.Generator) -> FloatArray:
