@@ -1,6 +1,6 @@
 """Triangles of a grid's zero level, against loops over tetrahedra and the area of a ball."""
 
-from itertools import permutations, product
+from itertools import pairwise, permutations, product
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def areas_by_loops(sdf):
                 polygon = [crossing(a, c), crossing(a, d), crossing(b, d), crossing(b, c)]
             else:
                 polygon = [crossing(a, b) for a in inside for b in outside]
-            for one, two in zip(polygon[1:], polygon[2:], strict=False):
+            for one, two in pairwise(polygon[1:]):
                 normal = np.cross(one - polygon[0], two - polygon[0])
                 found.append((len(inside), 0.5 * np.linalg.norm(normal)))
     return np.array([area for _, area in sorted(found, key=lambda each: each[0])])
