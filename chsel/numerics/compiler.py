@@ -384,7 +384,7 @@ class _CompilerWatch(event.Listener):
         if self._depth == 0:
             self._usual = _config.SLP_VECTORIZE
             _config.SLP_VECTORIZE = 1
-            # The collector takes a quarter of the time: the compiler makes objects by the million.
+            # The compiler makes objects by the million, over which the collector would go again.
             self._collected = gc.isenabled()
             gc.disable()
             if self.show is not None:
