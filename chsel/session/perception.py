@@ -17,8 +17,8 @@ from chsel.problem.points import (
     Workspace,
     away_from,
     check_places,
-    check_points,
     distinct_points,
+    require_possible,
     same_place,
     unit_normals,
     workspace_around,
@@ -125,11 +125,9 @@ class Intake:
         if grid is not None:
             given_workspace = started.workspace
             merged = points.merged(on_object)
-            check_points(
-                merged, started.sdf.diameter, free_resolution=spacing, workspace=given_workspace
-            )
+            require_possible(merged, started.sdf.diameter, workspace=given_workspace)
         else:
-            check_points(on_object, started.sdf.diameter, free_resolution=spacing)
+            require_possible(on_object, started.sdf.diameter)
             workspace = workspace_around(_first_places(perception, on_object), started.sdf)
             grid = FreeGrid(workspace, spacing)
             started = replace(started, workspace=workspace)
@@ -299,8 +297,8 @@ def perceived(
         )
     if image_normal_noise is not None and mask is None:
         raise PointsError("image_normal_noise has no mask; accepted: with depth and mask, or none")
-    free_points = known_points(free=free).free
-    others = known_points(occupied=occupied, known=known, known_sdf=known_sdf)
+    free_points = world_points("free", free)
+    others = world_known_points(occupied=occupied, known=known, known_sdf=known_sdf)
     nodes = np.zeros((0, 3))
     poses = swept = np.zeros((0, 4, 4))
     if path is not None:
