@@ -21,6 +21,7 @@ from chsel.numerics.arrays import (
     BoolArray,
     FloatArray,
     GrowingRows,
+    IntArray,
     ShapesShown,
     digest,
     evenly_spaced,
@@ -162,7 +163,9 @@ class KnownPoints(ShapesShown):
 
     def without_normals(self) -> KnownPoints:
         """Return these points as if no normal were known."""
-        return KnownPoints(self.free, self.occupied, known=self.known, known_sdf=self.known_sdf)
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        none = {name: np.zeros_like(arrays[name]) for name in ("normals", "normal_noise")}
+        return self._of(arrays | none)
 
     def merged(self, new: KnownPoints) -> KnownPoints:
         """Return these points followed by new ones, class by class.
@@ -478,14 +481,16 @@ class FreeVoxels:
 
     def __init__(self, lattice: Lattice) -> None:
         self.lattice = lattice
-        self._seen: set[tuple[int, int, int]] = set()
+        self._seen: set[int] = set()  # numbers of voxels
 
     def add(self, points: FloatArray) -> FloatArray:
         """Add the voxels of points (N, 3); return the centres (N', 3) of new ones by index."""
-        voxels = np.unique(self.lattice.voxels(np.asarray(points, float).reshape(-1, 3)), axis=0)
-        new = [voxel for voxel in map(tuple, voxels.tolist()) if voxel not in self._seen]
-        self._seen.update(new)
-        return self.lattice.centres(np.array(new, dtype=np.int64).reshape(-1, 3))
+        voxels = self.lattice.voxels(np.asarray(points, float).reshape(-1, 3))
+        found, first = np.unique(_numbers(voxels), return_index=True)
+        numbers = found.tolist()
+        new = np.array([number not in self._seen for number in numbers], dtype=bool)
+        self._seen.update(numbers)
+        return self.lattice.centres(voxels[first[new]])
 
     def forget(self) -> None:
         """Let the next points be new again, as after the object has moved."""
@@ -493,11 +498,17 @@ class FreeVoxels:
 
     def holds(self, points: FloatArray) -> BoolArray:
         """Return flags (N,) of points (N, 3) in a voxel added so far."""
-        voxels = map(tuple, self.lattice.voxels(points).tolist())
-        return np.array([voxel in self._seen for voxel in voxels], dtype=bool)
+        numbers = _numbers(self.lattice.voxels(points)).tolist()
+        return np.array([number in self._seen for number in numbers], dtype=bool)
 
     def __len__(self) -> int:
         return len(self._seen)
+
+
+def _numbers(voxels: IntArray) -> IntArray:
+    """Return a number (N,) for each of voxels (N, 3), ascending by index, within 2^20 voxels."""
+    x, y, z = voxels.T
+    return (x << 42) + (y << 21) + z
 
 
 _PARTS = {
