@@ -16,9 +16,9 @@ from chsel.next_probe.first_contact import (
     contact_normals,
     first_contacts,
 )
-from chsel.numerics.arrays import BoolArray, FloatArray, evenly_spaced
-from chsel.numerics.compiler import compiled, leaf
-from chsel.numerics.elementary import exp, exps, log, logs
+from chsel.numerics.arrays import BoolArray, FloatArray, evenly_spaced, scratch
+from chsel.numerics.compiler import compiled, inner, leaf
+from chsel.numerics.elementary import exp, exp_in_lanes, exps, log, logs
 from chsel.numerics.threads import parallel_for
 from chsel.problem.noise import FACET, WRONG_NORMALS
 from chsel.problem.points import KnownPoints, Workspace
@@ -37,6 +37,13 @@ from chsel.problem.surface import (
 )
 
 MOST_POSES = 2000
+LANES = 32  # actions whose gains are computed together, in vector instructions
+# Rows of numbers of a pose, one for each lane: where the hand meets the object, and if it does, 1,
+_X, _Y, _Z, _HIT = (np.uint64(n * LANES) for n in range(4))
+# and sums over all poses: of weights times overlaps; of weights times squared overlaps, these times
+# distances, and times squared distances.
+_ALIKE, _ALIVE, _FAR, _FARTHER = (np.uint64(n * LANES) for n in range(4, 8))
+_SIZE = 8 * LANES
 _DRAWN = 1000  # poses before any registration, of which those that free space allows are kept
 _SOME_FREE = 2000  # free points that rule most of these out, before all are compared
 _FARTHEST = 60.0  # exponents beyond count as zero
@@ -187,13 +194,18 @@ class Forecast:
         distances = self.distances
         contacts = self.first  # before threads begin, which must not wait for each other
         normals = self.normals
-        size = len(weights)
+        met = self.hit.any(axis=0)
+        missed = np.flatnonzero(~met)  # in every pose: their gains are those of the first
+        which = np.concatenate([np.flatnonzero(met), missed[:1]])
 
-        def run(first: int, last: int, scratch: Any) -> None:
-            some = (first, last)
-            overlap(contacts, normals, weights, distances, self.noise, gains, scratch, some)
+        def run(first: int, last: int, lanes: FloatArray) -> None:
+            some = which[first:last]
+            overlap(contacts, normals, weights, distances, self.noise, gains, lanes, some)
 
-        parallel_for(run, count, scratch=lambda: np.empty((4, size)), least=20)
+        size = (len(weights) + 1) * _SIZE
+        parallel_for(run, len(which), scratch=lambda: scratch(size), least=LANES, multiple=LANES)
+        for values in gains:
+            values[missed] = values[missed[:1]]
         return gains
 
     def _chance(self, flags: BoolArray) -> FloatArray:
@@ -209,70 +221,118 @@ def overlap(
     distances: Any,
     noise: Any,
     gains: Any,
-    scratch: Any,
-    some: Any,
+    lanes: Any,
+    which: Any,
 ) -> None:
-    """Fill `gains` of some actions (first, last) from how alike their outcomes are.
+    """Fill `gains` of some actions (C,), indices, from how alike their outcomes are.
 
     Outcomes of two poses overlap by the Bhattacharyya coefficient of Gaussians around their
     contacts, B = exp(-d^2 / 8 noise^2), times that of their normals, if these are forecast; by 1 if
     both miss, and hardly if one does. A pose survives another's outcome with likelihood B^2.
     Information is the pairwise bound of Kolchinsky and Tracey (Entropy, 2017),
     - sum_i w_i ln sum_j w_j B_ij.
+    lanes: scratch ((K + 1) _SIZE,), for each pose the rows of _X and so on, a number for each of
+    LANES actions, then a row of overlaps.
+    """
+    for begin in range(0, len(which), LANES):
+        end = min(begin + LANES, len(which))
+        some = which[begin:end]
+        _place_contacts(first, weights, lanes, some)
+        _add_overlaps(normals, weights, distances, 1.0 / (8.0 * noise * noise), lanes, some)
+        for lane in range(end - begin):
+            _sum_gains(weights, lanes, lane, gains, some[lane])
+
+
+@inner
+def _place_contacts(first: Any, weights: Any, lanes: Any, some: Any) -> None:
+    """Fill the rows of poses: contacts of some actions, and sums that have each pose alone."""
+    for i in range(len(weights)):
+        for lane in range(LANES):
+            at = np.uint64(i * _SIZE + lane)
+            a = some[min(lane, len(some) - 1)]  # lanes that are left over repeat the last action
+            lanes[at + _X] = first.contact[i, a, 0]
+            lanes[at + _Y] = first.contact[i, a, 1]
+            lanes[at + _Z] = first.contact[i, a, 2]
+            lanes[at + _HIT] = 1.0 if first.travel[i, a] < np.inf else 0.0
+            lanes[at + _ALIKE] = weights[i]
+            lanes[at + _ALIVE] = weights[i]
+            lanes[at + _FAR] = 0.0
+            lanes[at + _FARTHER] = 0.0
+
+
+@inner
+def _add_overlaps(
+    normals: Any, weights: Any, distances: Any, scale: Any, lanes: Any, some: Any
+) -> None:
+    """Add the overlaps of all pairs of poses to their sums; vectorised.
+
+    A loop for each sum, as the compiler makes no vector instructions of all in one.
     """
     count = len(weights)
     with_normals = len(normals.variances) > 0
-    scale = 1.0 / (8.0 * noise * noise)
-    alike = scratch[0]
-    alive = scratch[1]
-    far = scratch[2]
-    farther = scratch[3]
-    for a in range(some[0], some[1]):
-        for i in range(count):
-            alike[i] = weights[i]
-            alive[i] = weights[i]
-            far[i] = 0.0
-            farther[i] = 0.0
-        for i in range(count):
-            hit = first.travel[i, a] < np.inf
-            for j in range(i + 1, count):
-                b = 1.0
-                if hit != (first.travel[j, a] < np.inf):
-                    b = _UNLIKE
-                elif hit:
-                    x = first.contact[i, a, 0] - first.contact[j, a, 0]
-                    y = first.contact[i, a, 1] - first.contact[j, a, 1]
-                    z = first.contact[i, a, 2] - first.contact[j, a, 2]
-                    exponent = scale * (x * x + y * y + z * z)
-                    if exponent > _FARTHEST:
-                        continue
-                    b = exp(-exponent)
-                    if with_normals:
-                        b *= _normals_overlap(normals, i, j, a)
-                g = b * b
-                alike[i] += weights[j] * b
-                alike[j] += weights[i] * b
-                alive[i] += weights[j] * g
-                alive[j] += weights[i] * g
-                d = distances[i, j]
-                far[i] += weights[j] * g * d
-                far[j] += weights[i] * g * d
-                farther[i] += weights[j] * g * d * d
-                farther[j] += weights[i] * g * d * d
-        information = 0.0
-        left = 0.0
-        loss = 0.0
-        surviving = 0.0
-        for i in range(count):
-            if weights[i] > 0.0:
-                information -= weights[i] * log(alike[i])
-                left += weights[i] * farther[i] / alive[i]
-                loss += weights[i] * far[i] / alive[i]
-                surviving += weights[i] * alive[i]
-        gains.information[a] = max(information, 0.0)
-        gains.expected_spread[a] = np.sqrt(left)
-        gains.loss[a] = loss
-        gains.surviving[a] = surviving
+    size = np.uint64(_SIZE)
+    overlaps = np.uint64(count) * size
+    for i in range(count):
+        one = np.uint64(i) * size
+        for j in range(i + 1, count):
+            other = np.uint64(j) * size
+            for lane in range(LANES):
+                n = np.uint64(lane)
+                x = lanes[one + _X + n] - lanes[other + _X + n]
+                y = lanes[one + _Y + n] - lanes[other + _Y + n]
+                z = lanes[one + _Z + n] - lanes[other + _Z + n]
+                exponent = scale * (x * x + y * y + z * z)
+                near = exp_in_lanes(-min(exponent, _FARTHEST))
+                near = near if exponent <= _FARTHEST else 0.0
+                hits = lanes[one + _HIT + n] + lanes[other + _HIT + n]
+                lanes[overlaps + n] = near if hits == 2.0 else (_UNLIKE if hits == 1.0 else 1.0)
+            if with_normals:
+                for lane in range(len(some)):
+                    n = np.uint64(lane)
+                    if lanes[one + _HIT + n] + lanes[other + _HIT + n] == 2.0:
+                        lanes[overlaps + n] *= _normals_overlap(normals, i, j, some[lane])
+            u, v, d = weights[i], weights[j], distances[i, j]
+            for lane in range(LANES):
+                n = np.uint64(lane)
+                b = lanes[overlaps + n]
+                lanes[one + _ALIKE + n] += v * b
+                lanes[other + _ALIKE + n] += u * b
+            for lane in range(LANES):
+                n = np.uint64(lane)
+                g = lanes[overlaps + n] * lanes[overlaps + n]
+                lanes[one + _ALIVE + n] += v * g
+                lanes[other + _ALIVE + n] += u * g
+            for lane in range(LANES):
+                n = np.uint64(lane)
+                g = lanes[overlaps + n] * lanes[overlaps + n]
+                lanes[one + _FAR + n] += v * g * d
+                lanes[other + _FAR + n] += u * g * d
+            for lane in range(LANES):
+                n = np.uint64(lane)
+                g = lanes[overlaps + n] * lanes[overlaps + n]
+                lanes[one + _FARTHER + n] += v * g * d * d
+                lanes[other + _FARTHER + n] += u * g * d * d
+
+
+@inner
+def _sum_gains(weights: Any, lanes: Any, lane: Any, gains: Any, a: Any) -> None:
+    """Fill the gains of an action from the sums in its lane."""
+    information = 0.0
+    left = 0.0
+    loss = 0.0
+    surviving = 0.0
+    for i in range(len(weights)):
+        if weights[i] > 0.0:
+            at = np.uint64(i * _SIZE + lane)
+            alive = lanes[at + _ALIVE]
+            information -= weights[i] * log(lanes[at + _ALIKE])
+            left += weights[i] * lanes[at + _FARTHER] / alive
+            loss += weights[i] * lanes[at + _FAR] / alive
+            surviving += weights[i] * alive
+    gains.information[a] = max(information, 0.0)
+    gains.expected_spread[a] = np.sqrt(left)
+    gains.loss[a] = loss
+    gains.surviving[a] = surviving
 
 
 @leaf

@@ -6,6 +6,7 @@ import hashlib
 import math
 import os
 import sys
+import threading
 import zipfile
 from collections.abc import Collection
 from dataclasses import fields
@@ -87,6 +88,37 @@ def read_only(points: FloatArray) -> FloatArray:
     array = np.ascontiguousarray(points, dtype=np.float64).view()
     array.setflags(write=False)
     return array
+
+
+class GrowingRows:
+    """Memory of arrays that continue each other: each is its first rows, read-only.
+
+    It grows by doubling, so appending takes the time of what is appended. Rows in use never change.
+    """
+
+    def __init__(self, array: FloatArray) -> None:
+        """Begin with the rows of an array that nobody changes."""
+        self._memory = array
+        self._count = len(array)  # rows in use
+        self._lock = threading.Lock()
+
+    def appended(self, array: FloatArray, new: FloatArray) -> tuple[FloatArray, GrowingRows]:
+        """Return an array followed by new rows, and its memory; `array` has to be in this one.
+
+        It is another memory where other rows follow `array` here already.
+        """
+        first, last = len(array), len(array) + len(new)
+        with self._lock:
+            if first == self._count < last:
+                if last > len(self._memory):
+                    memory = np.empty((max(last, 2 * first), *array.shape[1:]))
+                    memory[:first] = array
+                    self._memory = memory
+                self._memory[first:last] = new
+                self._count = last
+            if last <= self._count and self._memory[first:last].tobytes() == new.tobytes():
+                return read_only(self._memory[:last]), self
+        return GrowingRows(array).appended(array, new)
 
 
 def scratch(*shape: int, dtype: Any = np.float64) -> NDArray[Any]:

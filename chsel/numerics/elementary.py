@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.compiler import compiled
+from chsel.numerics.compiler import compiled, leaf
 
 _HALF_PI = 1.5707963267948966
 _HALF_PI_TAIL = 6.123233995736766e-17  # pi/2 - _HALF_PI
@@ -92,6 +92,23 @@ def exp(x: float) -> float:
     y = head + (((1.0 - head) + r) + (r * r * _series(_EXP, r) + tail))
     half = np.int64(np.floor(0.5 * k))  # 2^k may overflow where y 2^k does not
     return y * _power_of_2(half) * _power_of_2(np.int64(k) - half)
+
+
+@leaf
+def exp_in_lanes(x: float) -> float:
+    """Return e^x from -700 to 700, the bits of `exp`, without a branch: loops can be vectorised."""
+    k = np.rint(x * 1.4426950408889634)
+    high = x - k * _LN_2_HIGH
+    low = k * _LN_2_LOW
+    r = high - low
+    tail = (high - r) - low
+    head = 1.0 + r
+    # A loop over the coefficients is not made into vector instructions.
+    c13, c12, c11, c10, c9, c8, c7, c6, c5, c4, c3, c2 = _EXP
+    upper = (((((c13 * r + c12) * r + c11) * r + c10) * r + c9) * r + c8) * r + c7
+    series = ((((upper * r + c6) * r + c5) * r + c4) * r + c3) * r + c2
+    y = head + (((1.0 - head) + r) + (r * r * series + tail))
+    return y * _power_of_2(np.int64(k))
 
 
 @compiled

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
@@ -20,8 +20,11 @@ from chsel.errors import (
 from chsel.numerics.arrays import (
     BoolArray,
     FloatArray,
+    GrowingRows,
+    IntArray,
     ShapesShown,
     digest,
+    evenly_spaced,
     frozen,
     read_only,
 )
@@ -29,6 +32,7 @@ from chsel.numerics.cell_set import bounds_of, set_voxels, voxels_of
 from chsel.problem.sdf_grid import SdfGrid
 
 FREE_RESOLUTION = 0.01  # side of a voxel of free space, metres
+_SURELY = 0.99  # of a distance: what is nearer is, however it is rounded
 _FEW = 300  # points whose distances take less time than importing and building a tree
 FARTHEST_PLACE = 1e5  # coordinates in the world, metres: turned, they are still within FARTHEST
 MANY_REPEATED = 0.1  # share of points at places that were measured before
@@ -124,12 +128,17 @@ class KnownPoints(ShapesShown):
     @property
     def count(self) -> int:
         """Number of points in all classes."""
-        return sum(len(getattr(self, name)) for name in POINT_CLASSES)
+        return len(self.free) + len(self.occupied) + len(self.known)
 
     @property
     def contacts(self) -> FloatArray:
         """The known points on the surface, with signed distance 0 (M', 3)."""
         return self.known[self.sdf == 0.0]
+
+    @property
+    def touching(self) -> FloatArray:
+        """The contacts, then the occupied points (T, 3)."""
+        return np.concatenate([self.contacts, self.occupied])
 
     @property
     def has_normals(self) -> bool:
@@ -142,26 +151,60 @@ class KnownPoints(ShapesShown):
         arrays = [getattr(self, name) for name in (*POINT_CLASSES, "known_sdf")]
         return digest(*arrays, *([self.normals, self.normal_noise] if self.has_normals else []))
 
+    @cached_property
+    def bounds(self) -> FloatArray:
+        """Lower and upper corner (2, 3) of the box around all points, at least one, metres."""
+        return _bounds(self.all_points())
+
     def with_known(self, which: Any) -> KnownPoints:
         """Return these points with some of the known ones: by flags (M,), indices or a slice."""
         parts = {name: getattr(self, name)[which] for name in _OF_KNOWN}
-        return replace(self, **parts)
+        return self._of(parts | {"free": self.free, "occupied": self.occupied})
 
     def without_normals(self) -> KnownPoints:
         """Return these points as if no normal were known."""
-        return KnownPoints(self.free, self.occupied, known=self.known, known_sdf=self.known_sdf)
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        none = {name: np.zeros_like(arrays[name]) for name in ("normals", "normal_noise")}
+        return self._of(arrays | none)
 
     def merged(self, new: KnownPoints) -> KnownPoints:
-        """Return these points followed by new ones, class by class."""
-        return KnownPoints.joined([self, new])
+        """Return these points followed by new ones, class by class.
+
+        It takes the time of the new ones: arrays share the memory of those that they continue.
+        """
+        if self.count == 0 or new.count == 0:
+            return new if self.count == 0 else self
+        grown = {
+            name: self._memory[name].appended(getattr(self, name), getattr(new, name))
+            for name in _ARRAYS
+        }
+        merged = self._of({name: array for name, (array, _) in grown.items()})
+        merged.__dict__["_memory"] = {name: memory for name, (_, memory) in grown.items()}
+        merged.__dict__["bounds"] = _bounds(np.concatenate([self.bounds, new.bounds]))
+        return merged
+
+    @cached_property
+    def _memory(self) -> dict[str, GrowingRows]:
+        """The memory of each array."""
+        return {name: GrowingRows(getattr(self, name)) for name in _ARRAYS}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in _ARRAYS}  # memory stays in its process
 
     @classmethod
     def joined(cls, parts: Sequence[KnownPoints]) -> KnownPoints:
         """Return the points of several parts, at least one, in their order, class by class."""
-        arrays: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS
-        }
-        return cls(**arrays)
+        return cls._of(
+            {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
+        )
+
+    @classmethod
+    def _of(cls, arrays: Mapping[str, FloatArray]) -> Self:
+        """Return the points of all arrays of others, which are checked already."""
+        points = cls.__new__(cls)
+        for name, array in arrays.items():
+            object.__setattr__(points, name, read_only(array))
+        return points
 
     def all_points(self) -> FloatArray:
         """Return every point of every class (N + K + M, 3)."""
@@ -191,6 +234,17 @@ class Workspace:
     def bounds(self) -> FloatArray:
         """Lower and upper corner (2, 3)."""
         return np.array([self.lower, self.upper])
+
+    def __str__(self) -> str:
+        """Return its sides, as errors show them."""
+        sides = zip(self.lower, self.upper, strict=True)
+        return "[" + ", ".join(f"[{low:g}, {high:g}]" for low, high in sides) + "]"
+
+    def distances(self, points: FloatArray) -> FloatArray:
+        """Return how far points (N, 3) are outside, metres (N,); 0 inside."""
+        lower, upper = self.bounds
+        beyond = np.maximum(np.maximum(lower - points, points - upper), 0.0)
+        return np.sqrt((beyond**2).sum(axis=1))
 
     @classmethod
     def around(cls, points: FloatArray, margin: float) -> Workspace:
@@ -349,6 +403,8 @@ def first_at_place(points: FloatArray, earlier: FloatArray, *, apart: float) -> 
     """Return flags (N,) of points (N, k) farther than `apart` from earlier (M, k) and kept ones."""
     first = away_from(points, earlier, apart=apart)
     left = np.flatnonzero(first)
+    if len(left) < 2:
+        return first
     left = left[np.sort(np.unique(points[left], axis=0, return_index=True)[1])]
     first[:] = False
     first[left] = True
@@ -425,14 +481,16 @@ class FreeVoxels:
 
     def __init__(self, lattice: Lattice) -> None:
         self.lattice = lattice
-        self._seen: set[tuple[int, int, int]] = set()
+        self._seen: set[int] = set()  # numbers of voxels
 
     def add(self, points: FloatArray) -> FloatArray:
         """Add the voxels of points (N, 3); return the centres (N', 3) of new ones by index."""
-        voxels = np.unique(self.lattice.voxels(np.asarray(points, float).reshape(-1, 3)), axis=0)
-        new = [voxel for voxel in map(tuple, voxels.tolist()) if voxel not in self._seen]
-        self._seen.update(new)
-        return self.lattice.centres(np.array(new, dtype=np.int64).reshape(-1, 3))
+        voxels = self.lattice.voxels(np.asarray(points, float).reshape(-1, 3))
+        found, first = np.unique(_numbers(voxels), return_index=True)
+        numbers = found.tolist()
+        new = np.array([number not in self._seen for number in numbers], dtype=bool)
+        self._seen.update(numbers)
+        return self.lattice.centres(voxels[first[new]])
 
     def forget(self) -> None:
         """Let the next points be new again, as after the object has moved."""
@@ -440,11 +498,17 @@ class FreeVoxels:
 
     def holds(self, points: FloatArray) -> BoolArray:
         """Return flags (N,) of points (N, 3) in a voxel added so far."""
-        voxels = map(tuple, self.lattice.voxels(points).tolist())
-        return np.array([voxel in self._seen for voxel in voxels], dtype=bool)
+        numbers = _numbers(self.lattice.voxels(points)).tolist()
+        return np.array([number in self._seen for number in numbers], dtype=bool)
 
     def __len__(self) -> int:
         return len(self._seen)
+
+
+def _numbers(voxels: IntArray) -> IntArray:
+    """Return a number (N,) for each of voxels (N, 3), ascending by index, within 2^20 voxels."""
+    x, y, z = voxels.T
+    return (x << 42) + (y << 21) + z
 
 
 _PARTS = {
@@ -474,21 +538,12 @@ def check_points(
     the object can be, if it was given and not derived from the points.
     Raises PointsError for points that no object of this size can have.
     """
+    require_possible(points, diameter, workspace=workspace)
     if points.count == 0 or diameter <= 0.0:
         return []
     contacts, free = points.contacts, points.free
-    touching = np.concatenate([contacts, points.occupied])
+    touching = points.touching
     warnings: list[PointsWarning] = []
-    for what, group, most in (
-        ("points on the object", touching, NEVER_APART),
-        ("known points", points.all_points(), NEVER_AROUND),
-    ):
-        # A far larger span is an error, unless a few outliers cause it.
-        if _diagonal(group) > most * diameter and _spread(group) > most * diameter:
-            raise PointsError(
-                f"{what} span {_diagonal(group):.4g} m, and the object is {diameter:.3g} m: are "
-                "they in millimetres? accepted: points in metres, and the object in the same unit"
-            )
     if (extent := _diagonal(touching)) > MOST_APART * diameter:
         text = (
             f"points on the object span {extent:.3g} m, and the object is {diameter:.3g} m; check "
@@ -496,7 +551,7 @@ def check_points(
         )
         warnings.append(PointsWarning("contacts_apart", text))
     both = len(contacts) > 0 and len(free) > 0
-    if both and _diagonal(np.concatenate([contacts, free])) > MOST_APART * diameter:
+    if both and _is_far(contacts, free, most=MOST_APART * diameter, bounds=points.bounds):
         from scipy.spatial import cKDTree  # which takes longer to import than most registrations
 
         distance, _ = cKDTree(free).query(contacts)
@@ -508,20 +563,12 @@ def check_points(
             )
             warnings.append(PointsWarning("contacts_far_from_free", text))
     if workspace is not None and len(touching):
-        lower, upper = workspace.bounds
-        beyond = np.maximum(np.maximum(lower - touching, touching - upper), 0.0)
-        distance = np.sqrt((beyond**2).sum(axis=1))
-        sides = zip(workspace.lower, workspace.upper, strict=True)
-        box = "[" + ", ".join(f"[{low:g}, {high:g}]" for low, high in sides) + "]"
-        if float(distance.min()) > diameter:
-            raise PointsError(
-                f"all points on the object are outside of the workspace {box}, the nearest "
-                f"{distance.min():.3g} m from it; accepted: a workspace that holds the object"
-            )
+        distance = workspace.distances(touching)
         if (outside := distance > MOST_OUTSIDE * diameter).any():
             text = (
-                f"{_count(outside, 'points on the object')} are outside of the workspace {box}, "
-                f"the farthest {distance.max():.3g} m from it; check workspace, units and frames"
+                f"{_count(outside, 'points on the object')} are outside of the workspace "
+                f"{workspace}, the farthest {distance.max():.3g} m from it; check workspace, units "
+                "and frames"
             )
             warnings.append(PointsWarning("contacts_outside", text))
     if both and (within := _enclosed(contacts, free, resolution=free_resolution)).any():
@@ -532,6 +579,39 @@ def check_points(
         )
         warnings.append(PointsWarning("contacts_in_free_space", text))
     return warnings
+
+
+def require_possible(
+    points: KnownPoints, diameter: float, *, workspace: Workspace | None = None
+) -> None:
+    """Raise PointsError for points that no object of this size can have.
+
+    Arguments as of `check_points`.
+    """
+    if points.count == 0 or diameter <= 0.0:
+        return
+    touching = points.touching
+    for what, bounds, most in (
+        ("points on the object", touching, NEVER_APART),
+        ("known points", points.bounds, NEVER_AROUND),
+    ):
+        extent = _diagonal(bounds)
+        if extent <= most * diameter:
+            continue
+        # A far larger span is an error, unless a few outliers cause it.
+        if _spread(touching if bounds is touching else points.all_points()) > most * diameter:
+            raise PointsError(
+                f"{what} span {extent:.4g} m, and the object is {diameter:.3g} m: are "
+                "they in millimetres? accepted: points in metres, and the object in the same unit"
+            )
+    if workspace is None or len(touching) == 0:
+        return
+    nearest = float(workspace.distances(touching).min())
+    if nearest > diameter:
+        raise PointsError(
+            f"all points on the object are outside of the workspace {workspace}, the nearest "
+            f"{nearest:.3g} m from it; accepted: a workspace that holds the object"
+        )
 
 
 def check_contacts(points: KnownPoints) -> list[PointsWarning]:
@@ -553,10 +633,11 @@ def _enclosed(contacts: FloatArray, free: FloatArray, *, resolution: float) -> B
     """
     lattice = Lattice(tuple(free[0].tolist()), resolution)
     wanted = lattice.voxels(contacts)[:, None] + _BLOCK  # (C, 27, 3)
-    lower = wanted.min(axis=(0, 1))
-    shape = tuple(wanted.max(axis=(0, 1)) - lower + 1)
+    lower, upper = wanted.min(axis=(0, 1)), wanted.max(axis=(0, 1))
+    shape = tuple(upper - lower + 1)
     if np.prod(shape, dtype=float) > _MOST_VOXELS:
         return np.zeros(len(contacts), dtype=bool)
+    free = _within(free, lattice.centres(np.array([lower - 1, upper + 1])))  # with all that count
     voxels = lattice.voxels(free) - lower
     near = ((voxels >= 0) & (voxels < shape)).all(axis=1)
     numbers = np.ravel_multi_index(tuple(voxels[near].T), shape)
@@ -566,6 +647,31 @@ def _enclosed(contacts: FloatArray, free: FloatArray, *, resolution: float) -> B
     places = {point.tobytes() for point in beside}
     same = np.array([contact.tobytes() in places for contact in contacts])
     return np.asarray(enclosed | same)
+
+
+def _is_far(contacts: FloatArray, free: FloatArray, *, most: float, bounds: FloatArray) -> bool:
+    """Return whether a contact may be farther than `most` metres from all free points.
+
+    bounds: of both, and of other points. Some of the free points show that most contacts are not.
+    """
+    if _diagonal(bounds) <= most or _diagonal(np.concatenate([contacts, free])) <= most:
+        return False
+    some = free[evenly_spaced(len(free), _FEW)]
+    return bool(away_from(contacts, some, apart=_SURELY * most).any())
+
+
+def _within(points: FloatArray, bounds: FloatArray) -> FloatArray:
+    """Return those of points (N, 3) in a box, by its lower and upper corner (2, 3)."""
+    kept = np.arange(len(points))
+    for axis in range(3):  # as most are beyond the first sides
+        values = points[kept, axis]
+        kept = kept[(values >= bounds[0, axis]) & (values <= bounds[1, axis])]
+    return points[kept]
+
+
+def _bounds(points: FloatArray) -> FloatArray:
+    """Return the lower and the upper corner (2, 3) of the box around points (N, 3), N > 0."""
+    return np.array([points.min(axis=0), points.max(axis=0)])
 
 
 def _diagonal(points: FloatArray) -> float:

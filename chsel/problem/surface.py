@@ -9,15 +9,24 @@ import numpy as np
 
 from chsel.errors import SdfError
 from chsel.numerics.arrays import FloatArray, IntArray, evenly_spaced
+from chsel.numerics.cell_set import Places, locate, places_for
 from chsel.numerics.compiler import compiled
-from chsel.numerics.pose_tuples import pose_at
+from chsel.numerics.pose_tuples import moved, pose_at
 from chsel.numerics.threads import parallel_for
 from chsel.problem.poses import Poses, rotated
 from chsel.problem.sdf_grid import FARTHEST, SdfGrid
-from chsel.problem.sdf_lookup import distance_at, distance_field, distance_with_gradient
+from chsel.problem.sdf_lookup import (
+    distance_between_nodes,
+    distance_beyond_box,
+    distance_field,
+    distance_with_gradient,
+    value_between_nodes,
+)
 from chsel.problem.streams import Purpose, StreamKey
 
 _CENTRE_POINTS = 1000
+_AT_ONCE = 256  # points that are located together
+_POSES_AT_ONCE = 16  # whose distances are looked up before they are summed, as long as in a cache
 _LOOKUPS_PER_THREAD = 6400  # fewer are done before another thread wakes up
 _PART = 1000  # cells that are cut at once
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)))  # (8, 3) of a cell
@@ -176,10 +185,13 @@ def outline_distances(sdf: SdfGrid, poses: Poses) -> FloatArray:
     other. As exact as the grid's interpolation, a fraction of its resolution.
     """
     places = outline_in_world(sdf, poses)[:, ::2]  # (B, Q, 3): both surfaces have as many
-    squares = np.array(
-        [in_order(signed_distances(sdf, poses, points=there) ** 2) for there in places]
-    )
-    squares /= max(places.shape[1], 1)
+    count, size = places.shape[:2]
+    squares = np.empty((count, count))
+    for first in range(0, count, _POSES_AT_ONCE):
+        some = slice(first, first + _POSES_AT_ONCE)
+        off = signed_distances(sdf, poses[some], points=places.reshape(-1, 3))
+        squares[some] = in_order(off.reshape(-1, count, size) ** 2)
+    squares /= max(size, 1)
     apart: FloatArray = np.sqrt(0.5 * (squares + squares.T))
     np.fill_diagonal(apart, 0.0)
     return apart
@@ -266,14 +278,14 @@ def surface_distances(sdf: SdfGrid, poses: Poses, *, points: FloatArray) -> Floa
     """Return signed distances (B, N), metres, of world points (N, 3) to the surface in poses."""
     field = distance_field(sdf, "trilinear", outside="surface_point")
     numbers = np.array(poses.numbers)
-    places = np.array(points)
+    columns = np.array(points.T, order="C")
     distances = np.empty((len(poses), len(points)))
 
-    def run(first: int, last: int, _: Any) -> None:
-        distances_from_surface(field, numbers, places, distances, first, last)
+    def run(first: int, last: int, places: Places) -> None:
+        distances_from_surface(field, numbers, columns, places, distances, first, last)
 
     least = 1 + _LOOKUPS_PER_THREAD // max(len(points), 1)
-    parallel_for(run, len(poses), scratch=lambda: None, least=least)
+    parallel_for(run, len(poses), scratch=lambda: places_for(_AT_ONCE), least=least)
     return distances
 
 
@@ -292,10 +304,27 @@ def gradients_in_poses(
 
 @compiled
 def distances_from_surface(
-    field: Any, poses: Any, places: Any, out: Any, first: Any, last: Any
+    field: Any, poses: Any, points: Any, places: Any, out: Any, first: Any, last: Any
 ) -> None:
-    """Fill out (B, K) with the distances of world points (K, 3) in poses (B, 12), first to last."""
+    """Fill out (B, K) with the distances of world points (3, K) in poses (B, 12), first to last."""
+    box, table = field.box, field.table
+    across, along = int(box.across), int(box.along)
+    size = len(places.cell)
     for b in range(first, last):
         pose = pose_at(poses, b)
-        for k in range(len(places)):
-            out[b, k] = distance_at(field, pose, places[k, 0], places[k, 1], places[k, 2])
+        for begin in range(0, points.shape[1], size):
+            count = min(size, points.shape[1] - begin)
+            x, y, z = points[0, begin:], points[1, begin:], points[2, begin:]
+            locate(pose, box, x, y, z, places, count)
+            for n in range(count):
+                u, v, w = places.u[n], places.v[n], places.w[n]
+                at = places.cell[n]
+                out[b, begin + n] = value_between_nodes(table, at, across, along, u, v, w)
+            for n in range(count):
+                if places.beyond[n] > 0.0:
+                    u, v, w = places.u[n], places.v[n], places.w[n]
+                    _, p, q, r = distance_between_nodes(box, table, places.cell[n], u, v, w)
+                    inside = out[b, begin + n], p, q, r
+                    a, c, d = moved(pose, x[n], y[n], z[n])
+                    beyond = distance_beyond_box(field.box_distance, box, inside, a, c, d)
+                    out[b, begin + n] = beyond[0]

@@ -450,15 +450,28 @@ def _orthonormal(vectors: FloatArray, metric: FloatArray) -> FloatArray:
 
     Vectors of next to no length are left out, such as turns that are symmetries of the object.
     """
-    result: list[FloatArray] = []
-    for vector in vectors:
-        size = float(np.abs(vector).max())
-        for other in result:
-            vector = vector - in_order(in_order(metric * other) * vector) * other
-        length = math.sqrt(max(float(in_order(in_order(metric * vector) * vector)), 0.0))
+    rows = metric.tolist()  # numbers of Python are faster than arrays of six
+    result: list[list[float]] = []
+    images: list[list[float]] = []  # of these, by the metric
+    for vector in vectors.tolist():
+        size = max(abs(value) for value in vector)
+        for other, image in zip(result, images, strict=True):
+            along = _dot(image, vector)
+            vector = [value - along * part for value, part in zip(vector, other, strict=True)]
+        length = math.sqrt(max(_dot([_dot(row, vector) for row in rows], vector), 0.0))
         if length > _LEAST_LENGTH * size:
-            result.append(vector / length)
+            unit = [value / length for value in vector]
+            result.append(unit)
+            images.append([_dot(row, unit) for row in rows])
     return np.array(result).reshape(-1, 6)
+
+
+def _dot(one: list[float], other: list[float]) -> float:
+    """Return the inner product of two vectors, added in order."""
+    total = one[0] * other[0]
+    for n in range(1, len(one)):
+        total += one[n] * other[n]
+    return total
 
 
 def _moved(problem: RegistrationProblem, pose: Poses, *, twists: FloatArray) -> Poses:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 MOST_VOXELS = 200_000_000  # two bytes each
 MOST_VIEWS = 250
-_REPORTED = 255  # more than any number of views
+_RUN = 1024  # voxels that are searched for marks together: most have none
 _RAYS_PER_THREAD = 20_000
 _POINTS_PER_THREAD = 100_000
 _STAY = np.eye(4)[None]
@@ -48,7 +48,7 @@ _ROUNDING = 1e-9  # steps: a move of one step is not two
 class MarkedVoxels(NamedTuple):
     """Marks of V voxels. Threads may mark one grid at once: all they ever do is write ones."""
 
-    marks: NDArray[np.uint8]  # (V,) in C order, 1 for a marked voxel
+    marks: NDArray[np.uint8]  # (V or more,) in C order, 1 for a marked voxel
     counts: tuple[int, int, int]  # voxels per axis
     lower: FloatArray  # (3,): centre of the first voxel, metres
     spacing: float  # of the centres, metres
@@ -89,8 +89,9 @@ class FreeGrid:
         self.count = 0
         self._views = int(views)
         voxels = prod(self.shape)
-        marks = np.zeros(voxels, dtype=np.uint8)  # in the current view
-        self._seen = np.zeros(voxels, dtype=np.uint8)  # number of views, then _REPORTED
+        marks = np.zeros(-(-voxels // _RUN) * _RUN, dtype=np.uint8)  # in the current view
+        self._fresh: list[NDArray[np.int64]] = []  # indices of voxels that `new` has not returned
+        self._seen = np.zeros(voxels, dtype=np.uint8)  # number of views
         self._grid = MarkedVoxels(
             marks, self.shape, lower=np.array(workspace.lower), spacing=float(spacing)
         )
@@ -140,14 +141,16 @@ class FreeGrid:
         """
         poses = frozen("poses", np.reshape(poses, (-1, 4, 4)), shape=(None, 4, 4), error=PoseError)
         points = _rows("points", points)
+        if len(points) == 0 or len(poses) == 0:
+            return 0
         least = -(-_POINTS_PER_THREAD // max(len(poses), 1))
         self._mark(mark_points, points, Poses.of(poses).numbers, count=len(points), least=least)
         return self._settle(self._views)
 
     def new(self) -> FloatArray:
         """Return centres (M, 3) of voxels that became free since the last call, by index."""
-        voxels = np.flatnonzero(self._seen == self._views)
-        self._seen[voxels] = _REPORTED
+        voxels = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *self._fresh]))
+        self._fresh = []
         return self.lattice.centres(np.stack(np.unravel_index(voxels, self.shape), axis=1))
 
     def _mark(self, kernel: Callable[..., None], *arguments: Any, count: int, least: int) -> None:
@@ -160,14 +163,18 @@ class FreeGrid:
 
     def _settle(self, views: int) -> int:
         """Count the marked voxels as seen in `views` more views; how many became free."""
-        marks, seen = self._grid.marks, self._seen
-        marked = np.flatnonzero(marks.view(np.bool_))
-        marks[marked] = 0
+        seen = self._seen
+        marks = self._grid.marks.view(np.bool_).reshape(-1, _RUN)
+        runs = np.flatnonzero(marks.any(axis=1))
+        run, place = np.divmod(np.flatnonzero(marks[runs]), _RUN)
+        marks[runs] = False
+        marked = runs[run] * _RUN + place
         marked = marked[seen[marked] < self._views]
         seen[marked] = np.minimum(seen[marked].astype(np.int64) + views, self._views)
-        fresh = int(np.count_nonzero(seen[marked] == self._views))
-        self.count += fresh
-        return fresh
+        fresh = marked[seen[marked] == self._views]
+        self._fresh.append(fresh)
+        self.count += len(fresh)
+        return len(fresh)
 
 
 def _shape(workspace: Workspace, spacing: float) -> tuple[int, int, int]:

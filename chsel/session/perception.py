@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -17,8 +18,8 @@ from chsel.problem.points import (
     Workspace,
     away_from,
     check_places,
-    check_points,
     distinct_points,
+    require_possible,
     same_place,
     unit_normals,
     workspace_around,
@@ -37,6 +38,7 @@ _MOST_WHOLE = 20  # m: of depths in whole numbers
 _MOST_SHOWN = 200  # poses of a path, in recordings
 _UNIT = 1e-4  # m: of recorded depths, up to 6.5 m; of others a multiple of it
 _ROUNDING = 1e-9  # of a number of units
+_HAND = "a mesh such as chsel.load_mesh(path)"
 _FINEST_DEPTHS = 6.5535  # m: up to which 16 bits hold tenths of a millimetre
 
 
@@ -125,11 +127,9 @@ class Intake:
         if grid is not None:
             given_workspace = started.workspace
             merged = points.merged(on_object)
-            check_points(
-                merged, started.sdf.diameter, free_resolution=spacing, workspace=given_workspace
-            )
+            require_possible(merged, started.sdf.diameter, workspace=given_workspace)
         else:
-            check_points(on_object, started.sdf.diameter, free_resolution=spacing)
+            require_possible(on_object, started.sdf.diameter)
             workspace = workspace_around(_first_places(perception, on_object), started.sdf)
             grid = FreeGrid(workspace, spacing)
             started = replace(started, workspace=workspace)
@@ -299,19 +299,18 @@ def perceived(
         )
     if image_normal_noise is not None and mask is None:
         raise PointsError("image_normal_noise has no mask; accepted: with depth and mask, or none")
-    free_points = known_points(free=free).free
-    others = known_points(occupied=occupied, known=known, known_sdf=known_sdf)
+    free_points = world_points("free", free)
+    others = world_known_points(occupied=occupied, known=known, known_sdf=known_sdf)
     nodes = np.zeros((0, 3))
     poses = swept = np.zeros((0, 4, 4))
     if path is not None:
+        import trimesh
+
         poses = frozen("path", path, shape=(None, 4, 4), error=PoseError, most=FARTHEST_PLACE)
         poses = nearest_rigid("path", poses)
-        bodies = hand_bodies(hand)
-        nodes = interior_lattice(bodies, 0.5 * spacing)
-        if len(nodes) == 0:
-            raise MeshError("hand has no inside; accepted: a closed mesh, metres")
-        corners = np.concatenate([body.vertices for body in bodies])
-        radius = float(np.sqrt((corners**2).sum(axis=1)).max())
+        require_instance("hand", hand, kind=trimesh.Trimesh, accepted=_HAND)
+        vertices, faces = np.array(hand.vertices, np.float64), np.array(hand.faces, np.int64)
+        nodes, radius = _inside_of_hand(vertices.tobytes(), faces.tobytes(), spacing=spacing)
         swept = poses_between(poses, step=0.5 * spacing, radius=radius)
     look = None
     seen = KnownPoints()
@@ -361,13 +360,31 @@ def _seen_points(look: DepthLook, normal_noise: Any) -> KnownPoints:
     )
 
 
+@lru_cache(maxsize=4)  # as most paths are of one hand
+def _inside_of_hand(vertices: bytes, faces: bytes, *, spacing: float) -> tuple[FloatArray, float]:
+    """Return points (M, 3) inside a hand, and how far it reaches from its origin, metres.
+
+    vertices, faces: of its mesh, rows of float64 and int64. spacing: side of free voxels, metres.
+    Raise MeshError for a hand without an inside.
+    """
+    import trimesh
+
+    corners = np.frombuffer(vertices).reshape(-1, 3)
+    triangles = np.frombuffer(faces, np.int64).reshape(-1, 3)
+    bodies = hand_bodies(trimesh.Trimesh(corners, triangles, process=False))
+    nodes = interior_lattice(bodies, 0.5 * spacing)
+    if len(nodes) == 0:
+        raise MeshError("hand has no inside; accepted: a closed mesh, metres")
+    corners = np.concatenate([body.vertices for body in bodies])
+    nodes.setflags(write=False)
+    return nodes, float(np.sqrt((corners**2).sum(axis=1)).max())
+
+
 def hand_bodies(hand: Any) -> list[trimesh.Trimesh]:
     """Return the bodies of a hand, turned outward. Raise MeshError for a mesh without faces."""
     import trimesh
 
-    require_instance(
-        "hand", hand, kind=trimesh.Trimesh, accepted="a mesh such as chsel.load_mesh(path)"
-    )
+    require_instance("hand", hand, kind=trimesh.Trimesh, accepted=_HAND)
     if len(hand.faces) == 0:
         raise MeshError("hand has no faces; accepted: a closed mesh, metres")
     vertices = frozen("hand vertices", hand.vertices, shape=(None, 3), error=MeshError)

@@ -122,7 +122,8 @@ class SceneMessages:
         step = -(-len(self._vertices) // _SURFACE_POINTS)
         self._surface = self._vertices[::step]  # (S, 3)
         points = [Point3(x=x, y=y, z=z) for x, y, z in self._vertices.tolist()]
-        self._mesh = TriangleListPrimitive(points=points, indices=faces.ravel().tolist())
+        self._points = serialized(TriangleListPrimitive(points=points))
+        self._faces = serialized(TriangleListPrimitive(indices=faces.ravel().tolist()))
 
     def object_mesh(self, time: int) -> bytes:
         """Return the object where the frame "object" is."""
@@ -156,14 +157,19 @@ class SceneMessages:
         colors: list[tuple[float, ...]],
         time: int,
     ) -> bytes:
-        """Return the object at poses (B, 4, 4), each in a color: RGB to 255, opacity to 1."""
+        """Return the object at poses (B, 4, 4), each in a color: RGB to 255, opacity to 1.
+
+        A message is the bytes of its fields in their order, so those of the mesh are made once.
+        """
         entity = SceneEntity(timestamp=stamp(time), id=name, frame_id=frame, frame_locked=True)
+        parts = [serialized(entity)]
         for pose, (r, g, b, a) in zip(_poses(poses), colors, strict=True):
-            triangles = entity.triangles.add(
-                pose=pose, color=Color(r=r / 255.0, g=g / 255.0, b=b / 255.0, a=a)
-            )
-            triangles.MergeFrom(self._mesh)
-        return serialized(SceneUpdate(entities=[entity]))
+            color = Color(r=r / 255.0, g=g / 255.0, b=b / 255.0, a=a)
+            placed = serialized(TriangleListPrimitive(pose=pose))
+            colored = serialized(TriangleListPrimitive(color=color))
+            data = placed + self._points + colored + self._faces
+            parts.append(_field(SceneEntity.TRIANGLES_FIELD_NUMBER, data))
+        return _field(SceneUpdate.ENTITIES_FIELD_NUMBER, b"".join(parts))
 
 
 class CumulativePoints:
@@ -279,6 +285,17 @@ def colored_cloud(points: FloatArray, color: ColorArray, time: int, frame: str =
 def empty_cloud(time: int) -> bytes:
     """Return a cloud of no points."""
     return colored_cloud(np.zeros((0, 3)), np.zeros(3, np.uint8), time=time)
+
+
+def _field(number: int, data: bytes) -> bytes:
+    """Return the bytes of a field of a message that is a message of these bytes."""
+    numbers = []
+    for value in ((number << 3) | 2, len(data)):  # 2: length and bytes follow
+        while value > 127:
+            numbers.append(value & 127 | 128)
+            value >>= 7
+        numbers.append(value)
+    return bytes(numbers) + data
 
 
 def _poses(poses: FloatArray) -> list[Pose]:

@@ -16,6 +16,7 @@ from chsel.problem.trust import SYMMETRIC, middle
 # Where these numbers are from: docs/anchored.md, "Numbers that are no settings".
 _SOFT = 0.02  # diameters: noise of the fit of an object to itself
 _STEPS = 20  # of this fit
+_TOGETHER = 4  # turns whose symmetries are looked for at once, the largest first
 _SMALL = 0.05  # radians: turns up to it are taken as they are, without looking for a symmetry
 
 
@@ -34,16 +35,20 @@ def pose_bound(sdf: SdfGrid, poses: Poses) -> tuple[float, float]:
     away = np.sqrt(((places - places[0]) ** 2).sum(axis=1))
     turns = product(poses.rotations[0], back)  # of the object, in its frame
     angles = rotation_angle(turns)
-    large = angles > _SMALL
-    angles[large] = _left(sdf, centre, turns=turns[large])
-    return float(away.max()), float(angles.max())
+    order = np.argsort(-angles, kind="stable")
+    large = order[angles[order] > _SMALL]
+    turn = float(angles[angles <= _SMALL].max(initial=0.0))
+    for first in range(0, len(large), _TOGETHER):
+        some = large[first : first + _TOGETHER]
+        if angles[some[0]] <= turn:  # what is left of a turn is no more than the turn
+            break
+        turn = max(turn, float(_left(sdf, centre, turns=turns[some]).max()))
+    return float(away.max()), turn
 
 
 def _left(sdf: SdfGrid, centre: FloatArray, *, turns: FloatArray) -> FloatArray:
     """Return angles (B,), radians, that turns (B, 3, 3) have left after their nearest symmetry."""
     angles = rotation_angle(turns)
-    if len(turns) == 0:
-        return angles
     energy = energy_in_itself(sdf, _SOFT * sdf.diameter)
     fits = fitted(
         energy, twists_of(SE3Space(), centre), poses=turned_about(centre, turns), steps=_STEPS

@@ -162,6 +162,22 @@ def test_gains_are_those_of_the_formulas(seed, count, reach, points):
     assert gains.loss == pytest.approx(loss, abs=1e-9)
 
 
+@pytest.mark.parametrize("points", [KnownPoints(), TOUCHED])
+def test_gains_of_an_action_have_the_same_bits_whatever_the_others_are(points):
+    """As many are computed together; those that miss in every pose have the gains of one."""
+    problem = replace(some_problem(5, 25, reach=0.1), points=points)
+    stream = np.random.default_rng(0)
+    places = stream.uniform(-0.18, 0.18, (75, 2)).tolist()
+    every = replace(problem, actions=along_x(places), available=np.ones(75, dtype=bool))
+    gains = Forecast(every, NOISE).gains
+    met = Forecast(every, NOISE).hit.any(axis=0)
+    assert 33 < met.sum() < 70
+    for n, place in enumerate(places):
+        alone = replace(problem, actions=along_x([place]), available=np.ones(1, dtype=bool))
+        for values, value in zip(gains, Forecast(alone, NOISE).gains, strict=True):
+            assert values[n] == value[0]
+
+
 def test_a_start_behind_the_object_is_blocked():
     problem = ball_problem(at((-0.35, 0.0, 0.0), (0.1, 0.0, 0.0)), along_x([(0.0, 0.0)]))
     assert Forecast(problem, NOISE).blocked_chance == pytest.approx([0.5])

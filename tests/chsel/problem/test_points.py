@@ -1,5 +1,7 @@
 """Known points, and those that cannot be, or hardly are, those of an object."""
 
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -140,6 +142,56 @@ def test_merging_appends_class_by_class_and_changes_the_digest():
     assert len({first.digest, second.digest, both.digest, second.merged(first).digest}) == 4
 
 
+def some_points(stream, free, known):
+    """Points of all classes, some of the known ones with normals, the zeros of either sign."""
+    normals = np.where(stream.random((known, 1)) < 0.5, [[0.0, -0.0, 1.0]], 0.0)
+    return KnownPoints(
+        free=np.rint(stream.normal(size=(free, 3))) * stream.choice([-1.0, 1.0]),
+        occupied=stream.normal(size=(free // 3, 3)),
+        known=stream.normal(size=(known, 3)),
+        known_sdf=stream.choice([0.0, -0.0, 0.02], known),
+        normals=normals,
+        normal_noise=np.where(normals.any(axis=1), 0.1, 0.0),
+    )
+
+
+def test_points_that_grow_are_those_of_all_parts_and_earlier_ones_never_change():
+    stream = np.random.default_rng(0)
+    parts = [some_points(stream, *stream.integers(0, 9, 2)) for _ in range(60)]
+    held = [KnownPoints()]
+    for part in parts:
+        held.append(held[-1].merged(part))
+    other = held[20].merged(parts[7])  # of which held[21] must not change
+    for count, points in enumerate(held):
+        arrays = ("free", "occupied", "known", "known_sdf", "normals", "normal_noise")
+        every = KnownPoints(
+            **{
+                name: np.concatenate(
+                    [getattr(part, name) for part in [KnownPoints(), *parts[:count]]]
+                )
+                for name in arrays
+            }
+        )
+        assert points.digest == every.digest
+        assert not points.free.flags.writeable
+        if count:
+            np.testing.assert_array_equal(points.bounds, every.bounds)
+    assert other.digest == KnownPoints.joined([*parts[:20], parts[7]]).digest
+    assert pickle.loads(pickle.dumps(held[40])).merged(parts[40]).digest == held[41].digest
+
+
+def test_points_that_grow_alike_share_their_memory():
+    stream = np.random.default_rng(1)
+    first, new = some_points(stream, 50, 50), some_points(stream, 5, 5)
+    one, other = first.merged(new), first.merged(new)
+    assert np.shares_memory(one.free, other.free)
+    turned = np.where(new.free == 0.0, -new.free, new.free)  # equal numbers, other bytes
+    other = first.merged(KnownPoints(free=turned, known=new.known))
+    assert not np.shares_memory(one.free, other.free)
+    np.testing.assert_array_equal(one.free, other.free)
+    assert np.signbit(one.free).sum() != np.signbit(other.free).sum()
+
+
 def test_voxels_keep_one_point_each_at_their_centres():
     voxels = FreeVoxels(Lattice((0.1, 0.0, 0.0), 0.025))
     new = voxels.add(np.array([[0.101, 0.0, 0.0], [0.11, 0.001, 0.0], [0.15, -0.03, 0.0]]))
@@ -203,6 +255,8 @@ def test_contacts_far_from_all_free_points_are_a_warning():
     text = check(["contacts_far_from_free"], free=free, known=away)
     assert "1 of 1 contacts are more than 10 object diameters from" in text
     check([], free=np.concatenate([free, away + 0.1]), known=away)
+    far = np.full((3000, 3), 20.0)
+    check([], free=np.concatenate([far[:7], free, far]), known=away - [[1.0, 0.0, 0.0]])
     between = np.array([[-3.0, 0.0, 0.0], [3.0, 0.0, 0.0]])  # two regions
     check(["contacts_far_from_free"], free=between, known=[[0.0, 0.0, 0.0]])
 

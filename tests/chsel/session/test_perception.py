@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 import chsel
+from chsel.problem.points import check_points
 from chsel.problem.poses import apply, compose, inverse
 from replay.mcap.reader import read_recording
 from tests.chsel.samples import box_distance
@@ -84,6 +85,36 @@ def test_points_of_an_image_have_normals_where_they_are_asked_for(tmp_path):
         (without | {"image_normal_noise": 0.2}, "image_normal_noise has no mask"),
     ):
         refused(text, session.add, **what)
+
+
+def test_many_adds_give_the_points_and_the_warnings_of_all_at_once():
+    """In any order, with places that repeat; points that somebody holds never change."""
+    stream = np.random.default_rng(0)
+    cube = 0.01 * np.argwhere(np.ones((8, 8, 8)))  # free space around three of the contacts
+    contacts = np.concatenate([CONTACTS - 0.03, cube[[150, 210, 290]] + 0.001])
+    room = chsel.Workspace((0.0, 0.0, 0.0), (0.36, 0.3, 0.3))
+    session = chsel.Session(BOX, workspace=room)
+    order = stream.permutation(len(contacts))
+    held = []
+    for some, place in zip(
+        np.array_split(stream.permutation(cube), len(order)), order, strict=True
+    ):
+        session.add(free=some, contact=contacts[place])
+        session.add(free=some + 0.001, contacts=contacts[order[:3]])
+        held.append((session.points, session.points.free.copy(), session.points.known.copy()))
+    found = codes(session)
+    for points, free, known in held:
+        np.testing.assert_array_equal(points.free, free)
+        np.testing.assert_array_equal(points.known, known)
+    points = chsel.KnownPoints(free=session.points.free, known=contacts[order])
+    assert session.points.digest == points.digest
+    assert sorted(points.free.tolist()) == sorted(cube.tolist())
+    points = chsel.KnownPoints(free=cube, known=contacts)
+    expected = check_points(points, session.intake.diameter, free_resolution=0.01, workspace=room)
+    assert [warning.code for warning in expected] == ["contacts_outside", "contacts_in_free_space"]
+    texts = {warning.code: warning.text for warning in session.warnings}
+    assert {warning.code: warning.text for warning in expected}.items() <= texts.items()
+    assert found[0] == "repeated"
 
 
 FARTHEST = float(np.finfo(np.float32).max)
