@@ -169,7 +169,9 @@ def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion():
     for start in nearby(8, 6):
         before = values(product, start[None])[0]
         climbers = climbers_at(product, Poses.of(start[None]).numbers)
-        climb(product, ASCENT, climbers=climbers, iterations=1, first=0, last=1, places=places_for(64))
+        climb(
+            product, ASCENT, climbers=climbers, iterations=1, first=0, last=1, places=places_for(64)
+        )
         xi = flow(product, start[None])[0]
         xi /= np.sqrt((xi**2).sum())
         expansion = np.polyfit(near, [dense.product(along(start, xi, tau=tau)) for tau in near], 8)[
@@ -192,7 +194,9 @@ def test_the_inner_product_never_falls_and_is_that_of_the_pose():
     climbers = climbers_at(product, Poses.of(starts).numbers)
     for _ in range(30):
         before = climbers.value.copy()
-        climb(product, ASCENT, climbers=climbers, iterations=1, first=0, last=5, places=places_for(64))
+        climb(
+            product, ASCENT, climbers=climbers, iterations=1, first=0, last=5, places=places_for(64)
+        )
         assert (climbers.value >= before).all()
         assert ((climbers.value > before) | climbers.done).all()
         np.testing.assert_array_equal(values_of(product, climbers.poses), climbers.value)
