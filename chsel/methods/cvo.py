@@ -39,7 +39,7 @@ from chsel.qd.selection import ranked
 
 MOST_ITERATIONS = 1_000_000
 _BLOCK = 10  # iterations between two traces
-_PATIENCE = 5
+_PATIENCE = 2
 _REFINEMENTS = 3
 _NEAR = 0.05  # steps count as equally long if they differ by less than this fraction
 MOST_NODES = 30_000_000
@@ -75,7 +75,7 @@ class CvoSettings(CheckedSettings):
     min_step: Annotated[float, positive] = 1e-4  # least length of a step that is tried first
     # Greatest length of a step that is tried first.
     max_step: Annotated[float, positive, at_most(1.0)] = 0.8
-    # A start ends when its inner product grew by no more than this fraction in 5 iterations in a
+    # A start ends when its inner product grew by no more than this fraction in 2 iterations in a
     # row; null: never.
     stop_below: Annotated[float | None, not_negative] = 1e-5
     # E_0 and E_l of the next problem.
