@@ -13,12 +13,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chsel.cost.free_kernels import FreeTerm, Neighbours, free_sums, neighbours_of, slope
+from chsel.cost.free_kernels import (
+    FreeTerm,
+    Neighbours,
+    between_nodes,
+    free_sums,
+    neighbours_of,
+    slope,
+    weigh_corners,
+)
 from chsel.numerics.arrays import FloatArray, scratch
 from chsel.numerics.cell_set import node_of
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import finite, pose_at
-from chsel.problem.sdf_lookup import DistanceField, at_node, distance_between_nodes
+from chsel.problem.sdf_lookup import DistanceField, at_node
 
 LANES = 8
 # The first 12 rows are the poses.
@@ -29,7 +37,8 @@ _BEYOND = 29 * LANES  # its square
 _PLACE = 30 * LANES  # the first of 3 rows: from the node of the cell, in cells
 _CELL = 33 * LANES
 _READ = 34 * LANES  # the first of 4 rows: signed distance and gradient
-_SIZE = 38 * LANES
+_WEIGHT = 38 * LANES  # the first of 8 rows: how much each corner of the cell counts
+_SIZE = 46 * LANES
 _SHORTEST = 1e-12
 
 
@@ -202,15 +211,15 @@ def _add(lanes, at, value, size, x, y, z):
 def _read(field, lanes, x, y, z):
     """Read signed distance and gradient at a world point, which is elsewhere for each pose."""
     _locate(field.box, lanes, x, y, z)
-    table, beyond = field.table, 0.0
+    beyond = 0.0
+    if field.trilinear:
+        weigh_corners(lanes, LANES, _PLACE, _WEIGHT, LANES)
     for at in range(LANES):
         cell = np.uint64(np.int64(lanes[_CELL + at]))
         if field.trilinear:
-            u, v = lanes[_PLACE + at], lanes[_PLACE + LANES + at]
-            w = lanes[_PLACE + 2 * LANES + at]
-            s, nx, ny, nz = distance_between_nodes(field.box, table, cell, u, v, w)
+            s, nx, ny, nz = between_nodes(field, cell, lanes, LANES, _WEIGHT + at)
         else:
-            s, nx, ny, nz = at_node(table, cell)
+            s, nx, ny, nz = at_node(field.table, cell)
         lanes[_READ + at], lanes[_READ + LANES + at] = s, nx
         lanes[_READ + 2 * LANES + at], lanes[_READ + 3 * LANES + at] = ny, nz
         beyond = max(beyond, lanes[_BEYOND + at])

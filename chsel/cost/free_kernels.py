@@ -200,7 +200,7 @@ def _sums_over(model, pose, move, numbers, count, block):
             _add_weights(pose, block, size)
         else:
             if model.field.trilinear:
-                _weigh_corners(block, whole)
+                weigh_corners(block, _MOST, _PLACE, _WEIGHT, whole)
                 _violate_between_nodes(model, block, size)
             else:
                 _violate_at_nodes(model, block, size)
@@ -248,44 +248,56 @@ def _locate(move, box, level, block, count):
         block[_CELL + n] = d * box.across + e * box.along + f
 
 
-@inner
-def _weigh_corners(block, count):
-    """Fill the weights of cell corners at each point, as distance_between_nodes has them."""
+@leaf
+def weigh_corners(rows, length, place, weight, count):
+    """Fill the weights of cell corners at fractions u, v, w, as distance_between_nodes has them.
+
+    rows: each of so many numbers; those of fractions begin at `place`, of weights at `weight`.
+    """
     for n in range(count):
-        u, v, w = block[_PLACE + n], block[_PLACE + _MOST + n], block[_PLACE + 2 * _MOST + n]
+        u, v, w = rows[place + n], rows[place + length + n], rows[place + 2 * length + n]
         a, b, c = 1.0 - u, 1.0 - v, 1.0 - w
         ab, av, ub, uv = a * b, a * v, u * b, u * v
-        block[_WEIGHT + n], block[_WEIGHT + _MOST + n] = ab * c, ab * w
-        block[_WEIGHT + 2 * _MOST + n], block[_WEIGHT + 3 * _MOST + n] = av * c, av * w
-        block[_WEIGHT + 4 * _MOST + n], block[_WEIGHT + 5 * _MOST + n] = ub * c, ub * w
-        block[_WEIGHT + 6 * _MOST + n], block[_WEIGHT + 7 * _MOST + n] = uv * c, uv * w
+        rows[weight + n], rows[weight + length + n] = ab * c, ab * w
+        rows[weight + 2 * length + n], rows[weight + 3 * length + n] = av * c, av * w
+        rows[weight + 4 * length + n], rows[weight + 5 * length + n] = ub * c, ub * w
+        rows[weight + 6 * length + n], rows[weight + 7 * length + n] = uv * c, uv * w
+
+
+@leaf
+def between_nodes(field, cell, rows, length, weight):
+    """Return distance and gradient in a cell, by eight weights in rows of a length, from `weight`.
+
+    Weights that a loop has filled before are vector code; those of distance_between_nodes are not.
+    """
+    table, box = field.table, field.box
+    across, along = np.uint64(np.int64(box.across)), np.uint64(np.int64(box.along))
+    at, row = np.uint64(weight), np.uint64(2 * length)
+    read = _with_edge(table, cell, rows, length, at, (0.0, 0.0, 0.0, 0.0))
+    read = _with_edge(table, cell + along, rows, length, at + row, read)
+    read = _with_edge(table, cell + across, rows, length, at + np.uint64(2) * row, read)
+    return _with_edge(table, cell + across + along, rows, length, at + np.uint64(3) * row, read)
+
+
+@leaf
+def _with_edge(table, node, rows, length, at, read):
+    """Return sums so far plus a node and the next on the third axis, with their weights."""
+    s, nx, ny, nz = read
+    weight = rows[at]
+    a, b, c, d = at_node(table, node)
+    s, nx, ny, nz = s + weight * a, nx + weight * b, ny + weight * c, nz + weight * d
+    weight = rows[at + np.uint64(length)]
+    a, b, c, d = at_node(table, node + np.uint64(1))
+    return s + weight * a, nx + weight * b, ny + weight * c, nz + weight * d
 
 
 @inner
 def _violate_between_nodes(model, block, count):
     """Fill the cost of each point where distances are interpolated, see _put_violation."""
-    table, box = model.field.table, model.field.box
-    across, along = np.uint64(np.int64(box.across)), np.uint64(np.int64(box.along))
     for n in range(np.uint64(count)):
         cell = np.uint64(np.int64(block[np.uint64(_CELL) + n]))
-        next_cell = cell + across
-        read = _with_edge(table, cell, block, 0, n, (0.0, 0.0, 0.0, 0.0))
-        read = _with_edge(table, cell + along, block, 2, n, read)
-        read = _with_edge(table, next_cell, block, 4, n, read)
-        read = _with_edge(table, next_cell + along, block, 6, n, read)
+        read = between_nodes(model.field, cell, block, _MOST, np.uint64(_WEIGHT) + n)
         _put_violation(model, block, n, cell, read)
-
-
-@leaf
-def _with_edge(table, node, block, corner, n, read):
-    """Return sums so far plus a node and the next on the third axis, with their weights."""
-    s, nx, ny, nz = read
-    weight = block[np.uint64(_WEIGHT + corner * _MOST) + n]
-    a, b, c, d = at_node(table, node)
-    s, nx, ny, nz = s + weight * a, nx + weight * b, ny + weight * c, nz + weight * d
-    weight = block[np.uint64(_WEIGHT + (corner + 1) * _MOST) + n]
-    a, b, c, d = at_node(table, node + np.uint64(1))
-    return s + weight * a, nx + weight * b, ny + weight * c, nz + weight * d
 
 
 @inner

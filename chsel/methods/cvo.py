@@ -16,7 +16,7 @@ import numpy as np
 
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
-from chsel.numerics.cell_set import Box, box_of, triple
+from chsel.numerics.cell_set import Box, Places, box_of, locate, places_for, triple
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp, exps, sine_cosine
 from chsel.numerics.pose_tuples import Triple, composed, moved, pose_at, turned_back
@@ -25,7 +25,7 @@ from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.sdf_grid import COARSEST, FINEST, SdfGrid
-from chsel.problem.sdf_lookup import cell_of, distance_between_nodes, value_between_nodes
+from chsel.problem.sdf_lookup import distance_between_nodes
 from chsel.problem.settings import (
     CheckedSettings,
     Presets,
@@ -39,12 +39,13 @@ from chsel.qd.selection import ranked
 
 MOST_ITERATIONS = 1_000_000
 _BLOCK = 10  # iterations between two traces
-_PATIENCE = 5
+_PATIENCE = 2
 _REFINEMENTS = 3
 _NEAR = 0.05  # steps count as equally long if they differ by less than this fraction
 MOST_NODES = 30_000_000
 FINENESS = 10  # at least so many nodes of a field per ell, if the SDF has them
 TRUNCATION = 3.5  # ell; beyond it lie 0.02 % of a Gaussian on either side
+_POINTS = 64  # that are located at once
 _FEW = 2000  # points that are taken one by one
 _FAR = 8.0  # ell; nothing is left of a kernel there
 _ON_LATTICE = 1e-6  # spacings that a point may be away from a node
@@ -74,7 +75,7 @@ class CvoSettings(CheckedSettings):
     min_step: Annotated[float, positive] = 1e-4  # least length of a step that is tried first
     # Greatest length of a step that is tried first.
     max_step: Annotated[float, positive, at_most(1.0)] = 0.8
-    # A start ends when its inner product grew by no more than this fraction in 5 iterations in a
+    # A start ends when its inner product grew by no more than this fraction in 2 iterations in a
     # row; null: never.
     stop_below: Annotated[float | None, not_negative] = 1e-5
     # E_0 and E_l of the next problem.
@@ -131,7 +132,7 @@ class Cvo(ConfiguredMethod[CvoSettings]):
             for first in range(0, most, _BLOCK):
                 last = min(first + _BLOCK, most)
                 run = partial(climb, product, ascent, climbers, last - first)
-                parallel_for(run, len(poses), scratch=lambda: None)
+                parallel_for(run, len(poses), scratch=_places)
                 estimates = Poses(climbers.poses.copy())
                 done = level * most + last
                 observer.trace("ascent", done, estimates.vectors, _costs(climbers.value, norm))
@@ -199,22 +200,29 @@ def climbers_at(product: Product, poses: FloatArray) -> Climbers:
     return Climbers(poses.copy(), value, step=step, stalled=stalled, done=done)
 
 
+def _places() -> Places:
+    """Return scratch for one thread."""
+    return places_for(_POINTS)
+
+
 @compiled
-def climb(product, ascent, climbers, iterations, first, last, _):
+def climb(product, ascent, climbers, iterations, first, last, places):
     """Move climbers uphill for some iterations, those from `first` to before `last`."""
     for n in range(first, last):
         for _ in range(iterations):
             if not climbers.done[n]:
                 pose = pose_at(climbers.poses, n)
-                xi, slope = _direction(product, ascent, pose)
-                uphill = slope > 0.0 and _step(product, ascent, pose, xi, slope, climbers, n)
-                climbers.done[n] = not uphill
+                xi, slope = _direction(product, ascent, pose, places)
+                climbers.done[n] = True
+                if slope > 0.0:
+                    uphill = _step(product, ascent, pose, xi, slope, climbers, n, places)
+                    climbers.done[n] = not uphill
 
 
 @inner
-def _direction(product, ascent, pose):
+def _direction(product, ascent, pose, places):
     """Return the unit flow (1/c sum x_i x h_i, 1/d sum h_i) about the origin, and F's slope."""
-    flow = flow_at(product, pose, ascent.centre)
+    flow = flow_at(product, pose, ascent.centre, places)
     a, b, c = flow[1] / ascent.c, flow[2] / ascent.c, flow[3] / ascent.c
     d, e, f = flow[4] / ascent.d, flow[5] / ascent.d, flow[6] / ascent.d
     size = np.sqrt(a * a + b * b + c * c + d * d + e * e + f * f)
@@ -227,17 +235,17 @@ def _direction(product, ascent, pose):
 
 
 @inner
-def _step(product, ascent, pose, xi, slope, climbers, n):
+def _step(product, ascent, pose, xi, slope, climbers, n, places):
     """Move climber n by the best step found along the flow; whether it goes on from there."""
     before, most = climbers.value[n], ascent.most
     tau = max(climbers.step[n], ascent.least)
     other = 0.0
     at_other = 0.0
-    value = product_at(product, _moved_along(pose, xi, tau))
+    value = product_at(product, _moved_along(pose, xi, tau), places)
     vertex = _vertex(tau, value - before, slope)
     while value > before and vertex > tau and tau < most:
         longer = min(2.0 * tau, most)
-        beyond = product_at(product, _moved_along(pose, xi, longer))
+        beyond = product_at(product, _moved_along(pose, xi, longer), places)
         if not beyond > value:
             other, at_other = longer, beyond
             break
@@ -249,7 +257,7 @@ def _step(product, ascent, pose, xi, slope, climbers, n):
     while value <= before and tau > ascent.least / 1024.0:
         other, at_other = tau, value
         tau = max(min(vertex, 0.5 * tau), 0.1 * tau)
-        value = product_at(product, _moved_along(pose, xi, tau))
+        value = product_at(product, _moved_along(pose, xi, tau), places)
         vertex = _vertex(tau, value - before, slope)
     if value <= before:
         return False
@@ -257,7 +265,7 @@ def _step(product, ascent, pose, xi, slope, climbers, n):
     for _ in range(_REFINEMENTS):
         if not (ahead <= most and abs(ahead - tau) > _NEAR * tau):
             break
-        at_ahead = product_at(product, _moved_along(pose, xi, ahead))
+        at_ahead = product_at(product, _moved_along(pose, xi, ahead), places)
         if at_ahead > value:
             tau, value, other, at_other = ahead, at_ahead, tau, value
         else:
@@ -319,21 +327,25 @@ def _moved_along(pose, xi, tau):
 
 
 @inner
-def flow_at(product, pose, centre):
+def flow_at(product, pose, centre, places):
     """Return F, sum x_i x h_i and sum h_i with h_i = R^T grad f(R x_i + t), x_i from the centre."""
     value = x = y = z = p = q = r = 0.0
     for term in product:
-        points = term.points
-        box = term.field.box
+        xs, ys, zs = term.points[0], term.points[1], term.points[2]
+        box, table = term.field.box, term.field.table
         m = term.weight
         f = gx = gy = gz = u = v = w = 0.0  # sums of f(p_i), grad f and p_i x grad f
-        for n in range(points.shape[1]):
-            a, b, c = moved(pose, points[0, n], points[1, n], points[2, n])
-            (at, _, _, i, j, k), is_beyond = cell_of(box, a, b, c)
-            if not is_beyond:
-                s, nx, ny, nz = distance_between_nodes(box, term.field.table, at, i, j, k)
-                f, gx, gy, gz = f + s, gx + nx, gy + ny, gz + nz
-                u, v, w = u + (b * nz - c * ny), v + (c * nx - a * nz), w + (a * ny - b * nx)
+        for first in range(0, len(xs), _POINTS):
+            last = min(first + _POINTS, len(xs))
+            x_of, y_of, z_of = xs[first:last], ys[first:last], zs[first:last]
+            locate(pose, box, x_of, y_of, z_of, places, last - first)
+            for n in range(last - first):
+                if places.beyond[n] == 0.0:
+                    i, j, k = places.u[n], places.v[n], places.w[n]
+                    s, nx, ny, nz = distance_between_nodes(box, table, places.cell[n], i, j, k)
+                    a, b, c = moved(pose, x_of[n], y_of[n], z_of[n])
+                    f, gx, gy, gz = f + s, gx + nx, gy + ny, gz + nz
+                    u, v, w = u + (b * nz - c * ny), v + (c * nx - a * nz), w + (a * ny - b * nx)
         value = value + m * f
         x = x + m * gx
         y = y + m * gy
@@ -362,6 +374,7 @@ class ClassField(NamedTuple):
 
     box: Box  # of its nodes
     table: Any  # (4 nodes,), f and its gradient at each node of the box; float32
+    values: Any  # (nodes,), f alone, so that fewer bytes are read; float32
     norm: float  # <f, f>
 
 
@@ -379,29 +392,47 @@ Product = tuple[ClassTerm, ...]  # F(X) = sum over classes of W sum_i f(R x_i + 
 def values_of(product: Product, poses: FloatArray) -> FloatArray:
     """Return F (B,) at poses (B, 12)."""
     out = np.empty(len(poses))
-    parallel_for(partial(_fill_values, product, poses, out), len(poses), scratch=lambda: None)
+    parallel_for(partial(_fill_values, product, poses, out), len(poses), scratch=_places)
     return out
 
 
 @compiled
-def _fill_values(product, poses, out, first, last, _):
+def _fill_values(product, poses, out, first, last, places):
     for n in range(first, last):
-        out[n] = product_at(product, pose_at(poses, n))
+        out[n] = product_at(product, pose_at(poses, n), places)
 
 
 @inner
-def product_at(product, pose):
+def product_at(product, pose, places):
     """Return F at a pose."""
     total = 0.0
     for term in product:
-        points, value = term.points, 0.0
-        for n in range(points.shape[1]):
-            a, b, c = moved(pose, points[0, n], points[1, n], points[2, n])
-            cell, is_beyond = cell_of(term.field.box, a, b, c)
-            if not is_beyond:
-                value += value_between_nodes(term.field.table, *cell)
+        xs, ys, zs = term.points[0], term.points[1], term.points[2]
+        box, values = term.field.box, term.field.values
+        value = 0.0
+        for first in range(0, len(xs), _POINTS):
+            last = min(first + _POINTS, len(xs))
+            x_of, y_of, z_of = xs[first:last], ys[first:last], zs[first:last]
+            locate(pose, box, x_of, y_of, z_of, places, last - first)
+            for n in range(last - first):
+                if places.beyond[n] == 0.0:
+                    value += _value_in_place(box, values, places, n)
         total += term.weight * value
     return total
+
+
+@leaf
+def _value_in_place(box, values, places, n):
+    """Return f at the n-th place, interpolated between the values (nodes,) of its cell's nodes."""
+    u, v, low, high = places.u[n], places.v[n], 1.0 - places.w[n], places.w[n]
+    across, along = np.uint64(np.int64(box.across)), np.uint64(np.int64(box.along))
+    at, next_node = np.uint64(places.cell[n]), np.uint64(1)
+    a = low * values[at] + high * values[at + next_node]
+    b = low * values[at + along] + high * values[at + along + next_node]
+    at += across
+    c = low * values[at] + high * values[at + next_node]
+    d = low * values[at + along] + high * values[at + along + next_node]
+    return (1.0 - u) * ((1.0 - v) * a + v * b) + u * ((1.0 - v) * c + v * d)
 
 
 def class_field(sdf: SdfGrid, kernel: Kernel, *, band: float, name: str) -> ClassField:
@@ -426,7 +457,8 @@ def class_field(sdf: SdfGrid, kernel: Kernel, *, band: float, name: str) -> Clas
             slope = moment - (p * stride - reach) * value
             table[..., axis + 1] = spacing / (kernel.ell * kernel.ell) * slope
         box = box_of(sdf.origin - reach * spacing, stride * spacing, shape=shape, between=True)
-        made = ClassField(box, table.reshape(-1), norm=0.0)
+        values = table[..., 0].reshape(-1)
+        made = ClassField(box, table.reshape(-1), values=values, norm=0.0)
         nodes = ClassTerm((sdf.origin + np.argwhere(members) * spacing).T.copy(), made)
         norm = values_of((nodes,), Poses.of(np.eye(4)[None]).numbers)
         return made._replace(norm=float(norm[0]))

@@ -26,6 +26,7 @@ from chsel.methods.cvo import (
     values_of,
 )
 from chsel.methods.method import Method
+from chsel.numerics.cell_set import places_for
 from chsel.numerics.pose_tuples import pose_at
 from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors
@@ -107,10 +108,10 @@ def nearby(count, seed, *, reach=0.08):
 
 
 @numba.njit(error_model="numpy")
-def flows(product, poses, out):
+def flows(product, poses, places, out):
     """Fill out (B, 7) with F, sum x_i x h_i and sum h_i, h = R^T grad f, at poses (B, 12)."""
     for n in range(len(poses)):
-        flow = flow_at(product, pose_at(poses, n), (0.0, 0.0, 0.0))
+        flow = flow_at(product, pose_at(poses, n), (0.0, 0.0, 0.0), places)
         for i in range(7):
             out[n, i] = flow[i]
 
@@ -138,7 +139,7 @@ def values(product, transforms):
 def flow(product, transforms):
     """Sums (B, 6) over x_i x h_i and h_i."""
     out = np.full((len(transforms), 7), np.nan)
-    flows(product, Poses.of(transforms).numbers, out)
+    flows(product, Poses.of(transforms).numbers, places_for(64), out)
     np.testing.assert_allclose(out[:, 0], values(product, transforms), rtol=1e-12)
     return out[:, 1:]
 
@@ -168,7 +169,9 @@ def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion():
     for start in nearby(8, 6):
         before = values(product, start[None])[0]
         climbers = climbers_at(product, Poses.of(start[None]).numbers)
-        climb(product, ASCENT, climbers=climbers, iterations=1, first=0, last=1, _=None)
+        climb(
+            product, ASCENT, climbers=climbers, iterations=1, first=0, last=1, places=places_for(64)
+        )
         xi = flow(product, start[None])[0]
         xi /= np.sqrt((xi**2).sum())
         expansion = np.polyfit(near, [dense.product(along(start, xi, tau=tau)) for tau in near], 8)[
@@ -191,7 +194,9 @@ def test_the_inner_product_never_falls_and_is_that_of_the_pose():
     climbers = climbers_at(product, Poses.of(starts).numbers)
     for _ in range(30):
         before = climbers.value.copy()
-        climb(product, ASCENT, climbers=climbers, iterations=1, first=0, last=5, _=None)
+        climb(
+            product, ASCENT, climbers=climbers, iterations=1, first=0, last=5, places=places_for(64)
+        )
         assert (climbers.value >= before).all()
         assert ((climbers.value > before) | climbers.done).all()
         np.testing.assert_array_equal(values_of(product, climbers.poses), climbers.value)
