@@ -81,20 +81,16 @@ def comparison_page(rows: Sequence[ComparedRow], about: Mapping[str, Any]) -> li
 
 
 def _compared(row: ComparedRow) -> dict[str, str]:
-    ratio, quartiles = "", ""
-    if row.ratios:
-        ratio = number(float(np.median(row.ratios)))
-    if len(row.ratios) > 1:
-        quartiles = "-".join(number(float(q)) for q in np.quantile(row.ratios, [0.25, 0.75]))
+    line = {"measure": row.case, "unit": row.unit, "of": row.clock}
+    for name, readings in (("other", row.other), ("this", row.this)):
+        line[name] = number(float(np.median(row.numbers(readings)))) if readings else "-"
+    ratios = row.ratios.tolist()
+    quartiles = np.quantile(ratios, [0.25, 0.75]).tolist() if len(ratios) > 1 else []
     return {
-        "measure": row.case,
-        "unit": row.unit,
-        "of": row.clock,
-        "other": number(float(np.median(row.other))) if row.other else "-",
-        "this": number(float(np.median(row.this))) if row.this else "-",
-        "ratio": ratio,
-        "quartiles": quartiles,
-        "pairs": str(len(row.ratios)),
+        **line,
+        "ratio": number(float(np.median(ratios))) if ratios else "",
+        "quartiles": "-".join(map(number, quartiles)),
+        "pairs": str(len(ratios)),
         "costs": ", ".join(map(number, row.costs)),
     }
 

@@ -15,9 +15,8 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from statistics import median, quantiles
 from typing import Any
 
 import numpy as np
@@ -32,29 +31,24 @@ _FINGER = (0.008, 0.008, 0.06)  # sides of the hand that probes along z, metres
 _ADDITIONS = 10  # calls of Session.add in one measurement
 
 
-@dataclass
 class Clocks:
-    """Seconds of named parts, by processor and by clock on the wall."""
+    """Seconds of named parts, by processor and by the clock on the wall."""
 
-    parts: dict[str, list[dict[str, float]]]  # one entry for each time that a part ran
+    def __init__(self) -> None:
+        self._parts: dict[str, list[tuple[float, float]]] = {}
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Measure a block."""
+        """Measure a block, which may run many times."""
         processor, wall = time.process_time(), time.perf_counter()
         yield
-        taken = {
-            "processor": time.process_time() - processor,
-            "wall": time.perf_counter() - wall,
-        }
-        self.parts.setdefault(name, []).append(taken)
+        taken = time.process_time() - processor, time.perf_counter() - wall
+        self._parts.setdefault(name, []).append(taken)
 
-    def medians(self) -> dict[str, dict[str, float]]:
-        """Return the median seconds of each part."""
-        return {
-            name: {clock: median(taken[clock] for taken in times) for clock in times[0]}
-            for name, times in self.parts.items()
-        }
+    def quantile(self, q: float = 0.5) -> dict[str, dict[str, float]]:
+        """Return a quantile of the seconds of each part, by default the median."""
+        found = {name: np.quantile(times, q, axis=0) for name, times in self._parts.items()}
+        return {name: {"processor": float(p), "wall": float(w)} for name, (p, w) in found.items()}
 
 
 class StageClock(NullObserver):
@@ -98,11 +92,11 @@ class Worker:
     def register(self, problem: str, method: str, *, settings: dict[str, Any]) -> dict[str, Any]:
         """Register a problem of a file, with settings other than the default ones."""
         posed = self._problem(problem)
-        clocks = Clocks({})
+        clocks = Clocks()
         with clocks.part(""):
             chosen = replace(chsel.build_method(method).settings, **settings)
             found = chsel.build_method(method, chosen).register(_fresh(posed))
-        return {"parts": clocks.medians(), "poses": found.object_from_world.tolist()}
+        return {"parts": clocks.quantile(), "poses": found.object_from_world.tolist()}
 
     def stages(self, problem: str) -> dict[str, Any]:
         """Register by `anchored` with an observer."""
@@ -114,17 +108,18 @@ class Worker:
         seconds = {**stages.seconds, "other": other}
         return {"parts": {name: {"processor": taken} for name, taken in seconds.items()}}
 
-    def steer(self, scene: str, steps: int, *, recorded: bool) -> dict[str, Any]:
-        """Steer a session as a robot's program does; medians of its steps, and their 95 %."""
-        data = _arrays(scene)
-        mesh = trimesh.Trimesh(data["vertices"], data["faces"], process=False)
-        robot = Robot(mesh, data["world_from_object"])
+    def steer(self, mesh: str, steps: int, *, recorded: bool) -> dict[str, Any]:
+        """Steer a session as examples/own_robot.py does: medians of its steps, and their 95 %."""
+        target = chsel.load_mesh(mesh)
+        truth = trimesh.transformations.rotation_matrix(0.7, [0, 0, 1])
+        truth[:3, 3] = 0.45, 0.1, 0.0
+        robot = Robot(target, truth)
         hand = trimesh.creation.box(_FINGER)
-        workspace = chsel.Workspace(tuple(data["lower"]), tuple(data["upper"]))
-        clocks = Clocks({})
+        table = chsel.Workspace((0.35, 0.0, 0.0), (0.55, 0.2, 0.2))
+        clocks = Clocks()
         with tempfile.TemporaryDirectory() as folder:
             record = Path(folder) / "session.mcap" if recorded else None
-            with chsel.Session(mesh, hand=hand, workspace=workspace, record=record) as session:
+            with chsel.Session(target, hand=hand, workspace=table, record=record) as session:
                 probe = session.next_probe()
                 while probe is not None and session.step + 1 < steps:
                     path, contact = robot.touch(probe.world_from_hand, probe.length)
@@ -137,47 +132,48 @@ class Worker:
                             _ = session.belief if session.trust is not None else None
                         with clocks.part("decide"):
                             probe = session.next_probe()
-        steps_taken = clocks.parts[""]
-        most = {
-            clock: quantiles([taken[clock] for taken in steps_taken], n=20, method="inclusive")[-1]
-            for clock in ("processor", "wall")
-        }
-        middle = clocks.medians()
-        names = ("add", "register", "belief", "decide") if recorded else ()
-        parts = {"": middle[""], "95 %": most} | {name: middle[name] for name in names}
-        return {"parts": parts, "count": len(steps_taken)}
+        return {"parts": {**clocks.quantile(), "95 %": clocks.quantile(0.95)[""]}}
 
-    def add(self, scene: str, known: int) -> dict[str, Any]:
+    def add(self, mesh: str, known: int) -> dict[str, Any]:
         """Add a contact and 300 free points to a session that knows so many free points."""
-        data = _arrays(scene)
-        mesh = trimesh.Trimesh(data["vertices"], data["faces"], process=False)
-        workspace = chsel.Workspace(tuple(data["lower"]), tuple(data["upper"]))
-        spacing = float(data["free_spacing"])
-        session = chsel.Session(mesh, workspace=workspace, free_resolution=spacing)
-        free, contacts = data["free"], data["contacts"]
+        target = chsel.load_mesh(mesh)
+        generator = np.random.default_rng(0)
+        contacts = generator.permutation(target.vertices)
+        lattice = 0.01 * np.indices((60, 60, 60)).reshape(3, -1).T - 0.295
+        lower, upper = target.bounds
+        outside = (np.clip(lattice, lower - 0.01, upper + 0.01) != lattice).any(axis=1)
+        free = generator.permutation(lattice[outside])
+        session = chsel.Session(target, workspace=chsel.Workspace((-0.3,) * 3, (0.3,) * 3))
         session.add(free=free[:known], contacts=contacts[:20])
-        clocks = Clocks({})
+        clocks = Clocks()
         for index in range(_ADDITIONS):
             new = free[known + 300 * index : known + 300 * (index + 1)]
             with clocks.part(""):
                 session.add(free=new, contacts=contacts[20 + index : 21 + index])
-        return {"parts": clocks.medians(), "count": len(session.points.free)}
+        if len(session.points.free) != known + 300 * _ADDITIONS:
+            raise RuntimeError(f"the session knows {len(session.points.free)} free points")
+        return {"parts": clocks.quantile()}
 
-    def plate(self, sides: list[float], scene: str) -> dict[str, Any]:
+    def plate(self, sides: list[float]) -> dict[str, Any]:
         """Make the grid of a plate, register it once, and read the memory of this process."""
         mesh = trimesh.creation.box(sides)
-        points = _arrays(scene)
-        clocks = Clocks({})
+        generator = np.random.default_rng(0)
+        contacts = generator.uniform(-0.5, 0.5, (20, 3)) * sides
+        contacts[:, 2] = 0.5 * sides[2]
+        free = generator.uniform(-0.2, 0.2, (300, 3))
+        free = free[np.abs(free[:, 2]) > 0.01]
+        clocks = Clocks()
         with clocks.part("grid"):
             chsel.SdfGrid.from_mesh(mesh)
         with clocks.part("first registration"):
-            chsel.register(mesh, contacts=points["contacts"], free=points["free"])
-        return {"parts": {**clocks.medians(), "peak memory": {"bytes": _peak_memory()}}}
+            chsel.register(mesh, contacts=contacts, free=free)
+        return {"parts": {**clocks.quantile(), "peak memory": {"bytes": _peak_memory()}}}
 
     def _problem(self, path: str) -> Any:
         """Return the problem of a file, read once."""
         if path not in self._problems:
-            data = _arrays(path)
+            with np.load(path) as arrays:
+                data = dict(arrays)
             mesh = trimesh.Trimesh(data["vertices"], data["faces"], process=False)
             self._problems[path] = chsel.RegistrationProblem(
                 sdf=chsel.SdfGrid.from_mesh(mesh, float(data["sdf_resolution"])),
@@ -193,11 +189,6 @@ class Worker:
 def _fresh(problem: Any) -> Any:
     """Return the problem with nothing computed from its points yet."""
     return replace(problem, points=replace(problem.points))
-
-
-def _arrays(path: str) -> dict[str, np.ndarray]:
-    with np.load(path) as data:
-        return dict(data)
 
 
 def _peak_memory() -> float:

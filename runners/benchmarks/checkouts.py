@@ -7,16 +7,17 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from chsel.errors import ChselError, SettingError
+from chsel.numerics.arrays import FloatArray
 from runners.published_package.worker_process import WorkerError, WorkerProcess, last_line
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -76,22 +77,29 @@ class ComparedRow:
     """One measurement of both checkouts."""
 
     case: str
-    unit: str
-    clock: str  # "processor", "wall" or "bytes"
-    other: tuple[float, ...]  # by the other checkout, in the order of the pairs; may be empty
-    this: tuple[float, ...]  # by this one; may be empty
+    unit: str  # of the numbers
+    clock: str  # which of the readings they are
+    other: tuple[Reading, ...]  # by the other checkout, in the order of the pairs; may be empty
+    this: tuple[Reading, ...]  # by this one; may be empty
     costs: tuple[float, ...] = ()  # of the best pose of a registration: the other's, ours
-    missing: str = ""  # why a side has no numbers
+    missing: str = ""  # why a side has no readings
+
+    def numbers(self, readings: Sequence[Reading]) -> FloatArray:
+        """Return readings in the row's unit."""
+        taken = np.array([reading[self.clock] for reading in readings])
+        return 60.0 / taken if self.unit == RATE else _UNITS[self.unit] * taken
 
     @property
-    def ratios(self) -> tuple[float, ...]:
-        """How many times as fast, or as small, this checkout is, by pair."""
-        ratios = np.divide(self.other, self.this) if self.other and self.this else np.empty(0)
-        return tuple((1.0 / ratios if self.unit == RATE else ratios).tolist())
+    def ratios(self) -> FloatArray:
+        """Ratios by pair: how many times as fast, or as small, this checkout is."""
+        if not (self.other and self.this):
+            return np.empty(0)
+        ratios = self.numbers(self.other) / self.numbers(self.this)
+        return 1.0 / ratios if self.unit == RATE else ratios
 
     def mapping(self) -> dict[str, Any]:
         """Return the row as the report's file has it."""
-        return {**asdict(self), "ratios": self.ratios}
+        return {**asdict(self), "ratios": self.ratios.tolist()}
 
 
 @dataclass
@@ -126,7 +134,8 @@ class Side:
 
     def run(
         self,
-        *arguments: str,
+        arguments: Sequence[str],
+        *,
         folder: Path | None = None,
         variables: Mapping[str, str] | None = None,
     ) -> Reading:
@@ -153,19 +162,22 @@ class Side:
         return {"processor": usage.ru_utime + usage.ru_stime, "wall": wall}
 
 
-@dataclass(frozen=True)
-class Answer:
+class Answer(NamedTuple):
     """The outcome of one measurement on one side."""
 
     parts: Mapping[str, Reading]  # by name; "" is all of it
     poses: Any = None  # of a registration, (B, 4, 4)
-    count: int = 1  # of what was done
 
 
 def asked(side: Side, task: str, **arguments: Any) -> Answer:
     """Return the answer of a side's process to a task of the worker."""
     answer = side.worker.ask(task, **arguments)
-    return Answer(answer["parts"], answer.get("poses"), count=answer.get("count", 1))
+    return Answer(answer["parts"], answer.get("poses"))
+
+
+def ran(side: Side, command: Sequence[str]) -> Answer:
+    """Return the time of a command of Python."""
+    return Answer({"": side.run(command)})
 
 
 class Comparison:
@@ -193,30 +205,6 @@ class Comparison:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def in_turn(
-        self, measure: Callable[[Side], Answer], *, repeats: int | None = None, warm: bool = True
-    ) -> tuple[dict[str, list[Answer]], str]:
-        """Return the answers of each side, and why one of them has none.
-
-        In pairs, of which every second begins with this checkout. warm: take one before, which
-        does not count.
-        """
-        answers: dict[str, list[Answer]] = {name: [] for name in self.sides}
-        failed: dict[str, str] = {}
-        for turn in range(-1 if warm else 0, repeats or self.repeats):
-            for name in list(self.sides)[:: 1 if turn % 2 else -1]:
-                if name in failed:
-                    continue
-                try:
-                    answer = measure(self.sides[name])
-                except (ChselError, OSError, LookupError) as error:
-                    failed[name] = str(error)
-                    answers[name] = []
-                    continue
-                if turn >= 0:
-                    answers[name].append(answer)
-        return answers, "; ".join(f"{name}: {why}" for name, why in failed.items())
-
     def rows(
         self,
         case: str,
@@ -224,38 +212,51 @@ class Comparison:
         *,
         unit: str = "ms",
         clock: str = "processor",
-        repeats: int | None = None,
+        seldom: bool = False,
         warm: bool = True,
         cost: Callable[[Any], float] | None = None,
     ) -> Iterator[ComparedRow]:
-        """Yield a row for each part of a measurement. cost: of the poses of a registration."""
-        answers, missing = self.in_turn(measure, repeats=repeats, warm=warm)
-        costs = tuple(
-            cost(taken[-1].poses) for taken in answers.values() if taken and cost is not None
-        )
-        everyone = [answer for taken in answers.values() for answer in taken]
-        parts = dict.fromkeys(part for answer in everyone for part in answer.parts) or {"": None}
-        for part in parts:
-            kind = "bytes" if any("bytes" in a.parts.get(part, {}) for a in everyone) else clock
-            shown = "MB" if kind == "bytes" else unit
-            samples = {
-                name: tuple(_in_unit(a, a.parts[part][kind], unit=shown) for a in taken)
+        """Yield a row for each part of a measurement that both checkouts take in turn.
+
+        In pairs, of which every second begins with this checkout. A part without readings of
+        `clock` is shown in bytes, or in seconds of the processor. seldom: a third as many pairs.
+        warm: measure once before, which does not count. cost: of the poses of a registration.
+        """
+        pairs = max(1, self.repeats // 3) if seldom else self.repeats
+        answers: dict[str, list[Answer]] = {name: [] for name in self.sides}
+        failed: dict[str, str] = {}
+        for turn in range(-1 if warm else 0, pairs):
+            for name in sorted(self.sides, reverse=turn % 2 == 0):
+                if name in failed:
+                    continue
+                try:
+                    answer = measure(self.sides[name])
+                except (ChselError, OSError, LookupError) as error:
+                    failed[name] = str(error)
+                    answers[name].clear()
+                else:
+                    answers[name] += [answer] if turn >= 0 else []
+        costs = [cost(taken[-1].poses) for taken in answers.values() if taken and cost]
+        parts = {
+            part: reading
+            for taken in answers.values()
+            for a in taken
+            for part, reading in a.parts.items()
+        }
+        for part, reading in (parts or {"": {clock: 0.0}}).items():
+            kind = clock if clock in reading else next(iter(reading))
+            readings = {
+                name: tuple(a.parts[part] for a in taken if part in a.parts)
                 for name, taken in answers.items()
-                if all(part in answer.parts for answer in taken)
             }
             yield ComparedRow(
                 ", ".join(filter(None, [case, part])),
-                shown,
+                unit if kind == clock else {"bytes": "MB", "processor": "s"}[kind],
                 clock=kind,
-                other=samples.get("other", ()),
-                this=samples.get("this", ()),
-                costs=costs if len(costs) == len(answers) else (),
-                missing=missing,
+                **readings,
+                costs=tuple(costs) if len(costs) == len(self.sides) else (),
+                missing="; ".join(f"{name}: {why}" for name, why in failed.items()),
             )
-
-
-def _in_unit(answer: Answer, taken: float, *, unit: str) -> float:
-    return 60.0 * answer.count / taken if unit == RATE else _UNITS[unit] * taken
 
 
 @contextmanager

@@ -14,13 +14,20 @@ import numpy as np
 
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.torch_cost import RelaxedCost
-from chsel.problem.mesh import load_mesh
-from chsel.problem.poses import apply, axis_angle, compose
 from chsel.problem.settings import in_preset
-from runners.benchmarks.checkouts import RATE, ROOT, Answer, ComparedRow, Comparison, Side, asked
-from runners.benchmarks.registrations import PROBLEMS, drill, outside, pose, standing
-from runners.sessions.configurations import WORKSPACE
+from runners.benchmarks.checkouts import (
+    RATE,
+    ROOT,
+    Answer,
+    ComparedRow,
+    Comparison,
+    Side,
+    asked,
+    ran,
+)
+from runners.benchmarks.registrations import PROBLEMS, drill, pose
 
+_MODELS = ROOT / "runners" / "objects" / "models"
 _STEPS = 12  # of a steered session
 _PLATE = (0.2, 0.12, 0.0006)  # metres
 _SIMULATED = find_spec("pybullet") is not None
@@ -30,6 +37,15 @@ _PROBE = (  # what `make probe` runs
     "object=drill",
     "method=chsel",
     f"session={'simulated' if _SIMULATED else 'kinematic'}",
+)
+_EVALUATE = (  # a cut of the experiment
+    "-m",
+    "runners.evaluate",
+    "experiment=sparse",
+    "configurations=mustard",
+    "seeds=30",
+    "faults=[clean,noise_1mm]",
+    "workers=2",
 )
 _COPIED = ("chsel", "replay", "runners", "conf", "tests", "pyproject.toml")
 _EDITED = {  # files of kernels, and their tests
@@ -45,15 +61,10 @@ def _registrations(
     for name, method, settings in cases:
         problem = pose(PROBLEMS[name], seed=0)
         cost = RelaxedCost.of(problem, in_preset(CostSettings(), "paper"))
+        what = {"problem": _problem_file(comparison, name), "method": method, "settings": settings}
         yield from comparison.rows(
             ", ".join([method, *settings.values(), name]),
-            partial(
-                asked,
-                task="register",
-                problem=_problem_file(comparison, name),
-                method=method,
-                settings=settings,
-            ),
+            partial(asked, task="register", **what),
             cost=partial(_least, cost),
         )
 
@@ -86,56 +97,24 @@ def stages(comparison: Comparison) -> Iterator[ComparedRow]:
 
 def session(comparison: Comparison) -> Iterator[ComparedRow]:
     """Yield steps of the steered session of examples/own_robot.py: medians, 95 %, and parts."""
-    mesh = load_mesh(ROOT / "runners/objects/models/mustard.ply")
-    turn = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.7))
-    truth = compose(turn, np.array([0.45, 0.1, 0.0]))
-    scene = comparison.scratch / "table.npz"
-    np.savez(
-        scene,
-        vertices=mesh.vertices,
-        faces=mesh.faces,
-        world_from_object=truth,
-        lower=(0.35, 0.0, 0.0),
-        upper=(0.55, 0.2, 0.2),
-    )
     for recorded, case in ((True, "step of a session"), (False, "step, not recorded")):
-        measure = partial(asked, task="steer", scene=str(scene), steps=_STEPS, recorded=recorded)
-        yield from comparison.rows(case, measure)
+        how = {"mesh": f"{_MODELS}/mustard.ply", "steps": _STEPS, "recorded": recorded}
+        yield from comparison.rows(case, partial(asked, task="steer", **how))
 
 
 def add(comparison: Comparison) -> Iterator[ComparedRow]:
-    """Yield `Session.add` of a contact and 300 free points at two sizes, around the drill."""
-    mesh = drill(1.0)[0]
-    truth = standing(mesh)
-    spacing = 0.01
-    generator = np.random.default_rng(0)
-    on_object = generator.choice(len(mesh.vertices), 100, replace=False)
-    scene = comparison.scratch / "known.npz"
-    np.savez(
-        scene,
-        vertices=mesh.vertices,
-        faces=mesh.faces,
-        free=generator.permutation(outside(mesh, truth, spacing=spacing)),
-        free_spacing=spacing,
-        contacts=apply(truth, np.asarray(mesh.vertices[on_object], dtype=np.float64)),
-        lower=WORKSPACE.lower,
-        upper=WORKSPACE.upper,
-    )
+    """Yield `Session.add` of a contact and 300 free points at two sizes."""
     for known in (3_000, 115_000):
-        measure = partial(asked, task="add", scene=str(scene), known=known)
+        measure = partial(asked, task="add", mesh=f"{_MODELS}/drill.ply", known=known)
         yield from comparison.rows(f"Session.add at {known} free points", measure)
 
 
 def startup(comparison: Comparison) -> Iterator[ComparedRow]:
     """Yield imports, and the help of a command, with the start of Python."""
-    cases = {
-        "import chsel": ("-c", "import chsel"),
-        "from chsel import Session": ("-c", "from chsel import Session"),
-        "runners.probe --help": ("-m", "runners.probe", "--help"),
-    }
-    for case, command in cases.items():
-        measure = partial(_ran, command=command)
-        yield from comparison.rows(case, measure)
+    for line in ("import chsel", "from chsel import Session"):
+        yield from comparison.rows(line, partial(ran, command=("-c", line)))
+    command = ("-m", "runners.probe", "--help")
+    yield from comparison.rows("runners.probe --help", partial(ran, command=command))
 
 
 def verify(comparison: Comparison) -> Iterator[ComparedRow]:
@@ -144,44 +123,36 @@ def verify(comparison: Comparison) -> Iterator[ComparedRow]:
     def once(side: Side) -> Answer:
         found = sorted(side.scratch.glob("probe/*/recording.mcap"))
         if not found:
-            side.run(*_PROBE, "recording=mcap", f"logs={side.scratch}")
+            side.run((*_PROBE, "recording=mcap", f"logs={side.scratch}"))
             found = sorted(side.scratch.glob("probe/*/recording.mcap"))
-        return _ran(side, ("-m", "replay", "verify", str(found[0])))
+        return ran(side, ("-m", "replay", "verify", str(found[0])))
 
     yield from comparison.rows("replay verify, drill", once, unit="s")
 
 
 def evaluation(comparison: Comparison) -> Iterator[ComparedRow]:
     """Yield registrations a minute of a cut of `experiment=sparse` by two workers."""
-    cut = ("configurations=mustard", "seeds=30", "faults=[clean,noise_1mm]", "workers=2")
 
     def once(side: Side) -> Answer:
         with tempfile.TemporaryDirectory(dir=side.scratch) as out:
-            taken = side.run("-m", "runners.evaluate", "experiment=sparse", *cut, f"out={out}")
-            lines = (Path(out) / "results.csv").read_text().splitlines()
-        return Answer({"": taken}, count=len(lines) - 1)
+            taken = side.run((*_EVALUATE, f"out={out}"))
+            count = len((Path(out) / "results.csv").read_text().splitlines()) - 1
+        processor = {"processor": taken["processor"] / count}
+        return Answer({"": {"wall": taken["wall"] / count}, "a registration": processor})
 
-    few = max(1, comparison.repeats // 3)
     yield from comparison.rows(
-        "experiment=sparse, two workers", once, unit=RATE, clock="wall", repeats=few, warm=False
+        "experiment=sparse, two workers", once, unit=RATE, clock="wall", seldom=True, warm=False
     )
 
 
 def plate(comparison: Comparison) -> Iterator[ComparedRow]:
     """Yield the first registration of a thin plate, its grid and peak memory, in new processes."""
-    generator = np.random.default_rng(0)
-    contacts = generator.uniform(-0.5, 0.5, (20, 3)) * _PLATE
-    contacts[:, 2] = 0.5 * _PLATE[2]
-    free = generator.uniform(-0.2, 0.2, (300, 3))
-    scene = comparison.scratch / "plate.npz"
-    np.savez(scene, contacts=contacts, free=free[np.abs(free[:, 2]) > 0.01])
 
     def once(side: Side) -> Answer:
         with side.start() as worker:
-            return Answer(worker.ask("plate", sides=_PLATE, scene=str(scene))["parts"])
+            return Answer(worker.ask("plate", sides=_PLATE)["parts"])
 
-    few = max(1, comparison.repeats // 3)
-    yield from comparison.rows("plate", once, unit="s", repeats=few)
+    yield from comparison.rows("plate", once, unit="s", seldom=True)
 
 
 def first_probe(comparison: Comparison) -> Iterator[ComparedRow]:
@@ -190,13 +161,12 @@ def first_probe(comparison: Comparison) -> Iterator[ComparedRow]:
     def once(side: Side) -> Answer:
         with tempfile.TemporaryDirectory(dir=side.scratch) as folder:
             command = (*_PROBE, f"logs={folder}")
-            first = side.run(*command, variables={"CHSEL_CACHE_DIR": f"{folder}/kernels"})
-            second = side.run(*command, variables={"CHSEL_CACHE_DIR": f"{folder}/kernels"})
+            first = side.run(command, variables={"CHSEL_CACHE_DIR": f"{folder}/kernels"})
+            second = side.run(command, variables={"CHSEL_CACHE_DIR": f"{folder}/kernels"})
         compiling = {clock: first[clock] - second[clock] for clock in first}
         return Answer({"all": first, "compiling": compiling})
 
-    few = max(1, comparison.repeats // 3)
-    yield from comparison.rows("first probe", once, unit="s", repeats=few, warm=False)
+    yield from comparison.rows("first probe", once, unit="s", seldom=True, warm=False)
 
 
 def edit(comparison: Comparison) -> Iterator[ComparedRow]:
@@ -213,18 +183,11 @@ def edit(comparison: Comparison) -> Iterator[ComparedRow]:
             source.write("# edited\n")
         variables = {"PYTHONPATH": str(copy), "CHSEL_CACHE_DIR": str(side.scratch / "kernels")}
         command = ("-m", "pytest", "-q", "-p", "no:cacheprovider", test)
-        return Answer({"": side.run(*command, folder=copy, variables=variables)})
+        return Answer({"": side.run(command, folder=copy, variables=variables)})
 
-    few = max(1, comparison.repeats // 3)
     for file, test in _EDITED.items():
         measure = partial(once, file=file, test=test)
-        yield from comparison.rows(
-            f"{test} after an edit of {file}", measure, unit="s", repeats=few
-        )
-
-
-def _ran(side: Side, command: Sequence[str]) -> Answer:
-    return Answer({"": side.run(*command)})
+        yield from comparison.rows(f"{test} after an edit", measure, unit="s", seldom=True)
 
 
 def _problem_file(comparison: Comparison, name: str) -> str:

@@ -38,7 +38,7 @@ from runners.objects.loader import ObjectConfig, load_object
 from runners.published_package.process import PublishedPackage
 from runners.sessions.configurations import WORKSPACE
 
-SDF_RESOLUTION = 0.01
+_SDF_RESOLUTION = 0.01
 _YAW = 0.5
 _THREADS = (1, 2)
 
@@ -140,7 +140,7 @@ def pose(problem: Problem, seed: int) -> RegistrationProblem:
     spacing = round(float(np.cbrt(volume / problem.free_points)), 4)  # whole tenths of a millimetre
     surface = trimesh.sample.sample_surface(mesh, problem.contacts, seed=seed)[0]
     contacts = apply(world_from_object, np.asarray(surface, dtype=np.float64))
-    points = KnownPoints(free=outside(mesh, world_from_object, spacing=spacing), known=contacts)
+    points = KnownPoints(free=_outside(mesh, world_from_object, spacing=spacing), known=contacts)
     settings = OnlineSettings(hypotheses=problem.hypotheses)
     initial_set = first_initial_set(WORKSPACE, points, key=StreamKey(seed, 0), settings=settings)
     return RegistrationProblem(
@@ -159,7 +159,7 @@ def drill(scale: float) -> tuple[trimesh.Trimesh, SdfGrid]:
     mesh = load_object(
         ObjectConfig("drill", scale, epsilon=0.001, configuration="drill"), Path()
     ).mesh
-    return mesh, SdfGrid.from_mesh(mesh, SDF_RESOLUTION)
+    return mesh, SdfGrid.from_mesh(mesh, _SDF_RESOLUTION)
 
 
 def standing(mesh: trimesh.Trimesh) -> FloatArray:
@@ -171,7 +171,7 @@ def standing(mesh: trimesh.Trimesh) -> FloatArray:
     return compose(turn, middle - turn @ foot)
 
 
-def outside(mesh: trimesh.Trimesh, world_from_object: FloatArray, *, spacing: float) -> FloatArray:
+def _outside(mesh: trimesh.Trimesh, world_from_object: FloatArray, *, spacing: float) -> FloatArray:
     """Return the points (N, 3) of a lattice in the workspace that are outside of the object."""
     # At whole multiples of the spacing, where the published package has its voxels, too.
     lower, upper = WORKSPACE.bounds

@@ -1,15 +1,15 @@
 """Two checkouts compared: ratios, pairs in turn, and this checkout beside itself."""
 
 import json
-import os
 import subprocess
-import sys
+from collections import defaultdict
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from runners import benchmark
+from runners.benchmarks.benchmark_report import comparison_page
 from runners.benchmarks.checkouts import (
     ROOT,
     Answer,
@@ -30,13 +30,21 @@ def comparison(measure, *, repeats=2, **how):
     return list(compared.rows("case", lambda side: measure(side.name), **how))
 
 
+def readings(clock, *values):
+    return tuple({clock: value} for value in values)
+
+
 def test_a_ratio_is_how_many_times_as_fast_this_checkout_is_by_pair():
-    times = ComparedRow("case", "ms", "processor", other=(10.0, 30.0), this=(5.0, 10.0))
-    assert times.ratios == (2.0, 3.0)
-    rates = ComparedRow("case", "1/min", "wall", other=(10.0,), this=(40.0,))
-    assert rates.ratios == (4.0,)
-    assert ComparedRow("case", "ms", "processor", other=(), this=(5.0,)).ratios == ()
-    assert times.mapping()["ratios"] == (2.0, 3.0)
+    other, this = readings("processor", 0.01, 0.03), readings("processor", 0.005, 0.01)
+    times = ComparedRow("case", "ms", "processor", other=other, this=this)
+    np.testing.assert_allclose(times.numbers(times.other), [10.0, 30.0])
+    np.testing.assert_allclose(times.ratios, [2.0, 3.0])
+    np.testing.assert_allclose(times.mapping()["ratios"], [2.0, 3.0])
+    other, this = readings("wall", 2.0), readings("wall", 0.5)
+    rates = ComparedRow("case", "1/min", "wall", other=other, this=this)
+    np.testing.assert_allclose(rates.numbers(rates.this), [120.0])
+    np.testing.assert_allclose(rates.ratios, [4.0])
+    assert len(ComparedRow("case", "1/min", "wall", other=(), this=this).ratios) == 0
 
 
 def test_sides_take_turns_and_what_comes_first_does_not_count():
@@ -45,15 +53,18 @@ def test_sides_take_turns_and_what_comes_first_does_not_count():
     def measure(name):
         order.append(name)
         taken = {"processor": 0.001 * len(order), "wall": 1.0}
-        return Answer({"": taken, "memory": {"bytes": 3e6}}, count=5)
+        return Answer({"": taken, "memory": {"bytes": 3e6}})
 
     time, memory = comparison(measure)
     assert order == ["other", "this", "this", "other", "other", "this"]
-    assert time.other == pytest.approx((4.0, 5.0))
-    assert time.this == pytest.approx((3.0, 6.0))
-    assert (memory.case, memory.unit, memory.other) == ("case, memory", "MB", (3.0, 3.0))
-    (rate, _) = comparison(measure, unit="1/min", clock="wall", repeats=1, warm=False)
-    assert rate.this == (300.0,)
+    np.testing.assert_allclose(time.numbers(time.other), [4.0, 5.0])
+    np.testing.assert_allclose(time.numbers(time.this), [3.0, 6.0])
+    assert (memory.case, memory.unit) == ("case, memory", "MB")
+    np.testing.assert_allclose(memory.numbers(memory.this), [3.0, 3.0])
+    order.clear()
+    (rate, _) = comparison(measure, unit="1/min", clock="wall", seldom=True, warm=False)
+    assert order == ["this", "other"]
+    assert rate.numbers(rate.this) == [60.0]
 
 
 def test_a_side_that_cannot_do_a_measurement_says_why_and_the_other_goes_on():
@@ -63,8 +74,13 @@ def test_a_side_that_cannot_do_a_measurement_says_why_and_the_other_goes_on():
         return Answer({"": {"processor": 0.5}})
 
     (row,) = comparison(measure, unit="s")
-    assert (row.other, row.this, row.ratios) == ((), (0.5, 0.5), ())
+    assert (row.other, len(row.this), len(row.ratios)) == ((), 2, 0)
     assert row.missing == "other: no such method"
+    cells = comparison_page([row], {"machine": defaultdict(float), "checkouts": {}})[-4]
+    assert [cell.strip() for cell in cells.split("|")[4:7]] == ["-", "0.5", ""]
+    assert comparison_page([row], {"machine": defaultdict(float), "checkouts": {}})[-2] == (
+        "case: other: no such method"
+    )
 
 
 def test_a_revision_is_checked_out_for_as_long_as_it_is_needed(tmp_path):
@@ -82,20 +98,15 @@ def test_a_revision_is_checked_out_for_as_long_as_it_is_needed(tmp_path):
 
 
 def test_this_checkout_beside_itself_has_a_ratio_for_every_stage(tmp_path):
-    command = [sys.executable, "-m", "runners.benchmark", f"against={ROOT}", "quick=true"]
-    environment = {**os.environ, "COLUMNS": "80", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [*command, "rows=[stages]", f"logs={tmp_path}"],
-        capture_output=True,
-        text=True,
-        env=environment,
-    )
+    words = (f"against={ROOT}", "quick=true", "rows=[stages]", f"logs={tmp_path}")
+    done = in_process(benchmark.main, *words)
     assert done.returncode == 0, done.stderr
     (folder,) = (tmp_path / "benchmark").iterdir()
     rows = json.loads((folder / "benchmark.json").read_text())["rows"]
     for row in rows:
         assert len(row["other"]) == len(row["this"]) == 2
-        np.testing.assert_allclose(row["ratios"], np.divide(row["other"], row["this"]))
+        other, this = ([taken["processor"] for taken in row[side]] for side in ("other", "this"))
+        np.testing.assert_allclose(row["ratios"], np.divide(other, this))
     assert {row["case"].rpartition(", ")[2] for row in rows} == {
         *("sample", "fit", "search", "descend", "spread", "other")
     }
