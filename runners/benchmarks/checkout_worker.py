@@ -208,6 +208,8 @@ def main() -> None:
         answers.write(json.dumps(values) + "\n")
         answers.flush()
 
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {int(sys.argv[1])})
     worker = Worker()
     answer({"chsel": str(Path(str(chsel.__file__)).parent)})
     for line in sys.stdin:

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -102,6 +102,15 @@ class ComparedRow:
         return {**asdict(self), "ratios": self.ratios.tolist()}
 
 
+@cache
+def _core() -> int:
+    """Return the core that both processes of a comparison run on, as others may be busier."""
+    if not hasattr(os, "sched_getaffinity"):  # macOS
+        return 0
+    cores = sorted(os.sched_getaffinity(0))
+    return cores[os.getpid() % len(cores)]
+
+
 @dataclass
 class Side:
     """One of the two checkouts, with its process."""
@@ -117,7 +126,9 @@ class Side:
     def start(self) -> WorkerProcess:
         """Start a process of this checkout."""
         try:
-            worker = WorkerProcess([sys.executable, "-P", str(_WORKER)], self.environment)
+            worker = WorkerProcess(
+                [sys.executable, "-P", str(_WORKER), str(_core())], self.environment
+            )
         except WorkerError as error:
             raise CheckoutError(f"the checkout {self.folder} cannot be used: {error}") from None
         if Path(worker.description["chsel"]) != self.folder / "chsel":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.torch_cost import RelaxedCost
+from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import in_preset
 from runners.benchmarks.checkouts import (
     RATE,
@@ -59,12 +60,11 @@ def _registrations(
 ) -> Iterator[ComparedRow]:
     """Yield registrations of problems by methods with settings."""
     for name, method, settings in cases:
-        problem = pose(PROBLEMS[name], seed=0)
-        cost = RelaxedCost.of(problem, in_preset(CostSettings(), "paper"))
-        what = {"problem": _problem_file(comparison, name), "method": method, "settings": settings}
+        file = _problem_file(comparison, name)
+        cost = RelaxedCost.of(_problem(name), in_preset(CostSettings(), "paper"))
         yield from comparison.rows(
             ", ".join([method, *settings.values(), name]),
-            partial(asked, task="register", **what),
+            partial(asked, task="register", problem=file, method=method, settings=settings),
             cost=partial(_least, cost),
         )
 
@@ -98,8 +98,9 @@ def stages(comparison: Comparison) -> Iterator[ComparedRow]:
 def session(comparison: Comparison) -> Iterator[ComparedRow]:
     """Yield steps of the steered session of examples/own_robot.py: medians, 95 %, and parts."""
     for recorded, case in ((True, "step of a session"), (False, "step, not recorded")):
-        how = {"mesh": f"{_MODELS}/mustard.ply", "steps": _STEPS, "recorded": recorded}
-        yield from comparison.rows(case, partial(asked, task="steer", **how))
+        mesh = f"{_MODELS}/mustard.ply"
+        measure = partial(asked, task="steer", mesh=mesh, steps=_STEPS, recorded=recorded)
+        yield from comparison.rows(case, measure)
 
 
 def add(comparison: Comparison) -> Iterator[ComparedRow]:
@@ -190,11 +191,16 @@ def edit(comparison: Comparison) -> Iterator[ComparedRow]:
         yield from comparison.rows(f"{test} after an edit", measure, unit="s", seldom=True)
 
 
+@cache
+def _problem(name: str) -> RegistrationProblem:
+    return pose(PROBLEMS[name], seed=0)
+
+
 def _problem_file(comparison: Comparison, name: str) -> str:
     """Write one of PROBLEMS for the processes, and return its path."""
     path = comparison.scratch / f"{name}.npz"
     if not path.exists():
-        problem = pose(PROBLEMS[name], seed=0)
+        problem = _problem(name)
         mesh = drill(PROBLEMS[name].scale)[0]
         np.savez(
             path,
