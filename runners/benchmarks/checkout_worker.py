@@ -132,14 +132,17 @@ class Worker:
                             _ = session.belief if session.trust is not None else None
                         with clocks.part("decide"):
                             probe = session.next_probe()
-        return {"parts": {**clocks.quantile(), "95 %": clocks.quantile(0.95)[""]}}
+        middle = clocks.quantile()
+        names = ("add", "register", "belief", "decide") if recorded else ()
+        parts = {"": middle[""], "95 %": clocks.quantile(0.95)[""]}
+        return {"parts": parts | {name: middle[name] for name in names}}
 
     def add(self, mesh: str, known: int) -> dict[str, Any]:
         """Add a contact and 300 free points to a session that knows so many free points."""
         target = chsel.load_mesh(mesh)
         generator = np.random.default_rng(0)
         contacts = generator.permutation(target.vertices)
-        lattice = 0.01 * np.indices((60, 60, 60)).reshape(3, -1).T - 0.295
+        lattice = 0.01 * np.indices((60, 60, 60)).reshape(3, -1).T - 0.29
         lower, upper = target.bounds
         outside = (np.clip(lattice, lower - 0.01, upper + 0.01) != lattice).any(axis=1)
         free = generator.permutation(lattice[outside])
