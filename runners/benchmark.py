@@ -1,4 +1,7 @@
-"""`python -m runners.benchmark`: time registrations, beside those of the published package."""
+"""`python -m runners.benchmark`: time registrations, beside those of the published package.
+
+With `against=REF`: time what a session and a program do, beside another checkout.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +22,14 @@ from chsel.problem.streams import StreamKey
 from replay.console import Console
 from replay.environment import environment
 from runners.benchmarks import benchmark_report
+from runners.benchmarks.checkouts import ComparedRow, commit_of, comparison
+from runners.benchmarks.compared_rows import GROUPS
 from runners.benchmarks.registrations import MEASURES, PROBLEMS, Row, Scope, Steps, compare
 from runners.command.program import command, plain
 from runners.published_package.process import PackageConfig, PublishedPackage, interpreter
 from runners.run.recording import make_run_folder, write_in_run_folder
+
+_QUICK = ("anchored", "stages")  # rows of a short comparison
 
 
 @dataclass(frozen=True)
@@ -45,6 +52,8 @@ class BenchmarkConfig:
     repeats: int
     seed: int
     quick: bool
+    against: str | None  # another checkout, to compare this one with it
+    rows: tuple[str, ...]  # of that comparison
 
     def __post_init__(self) -> None:
         StreamKey(self.seed, 0)
@@ -53,6 +62,8 @@ class BenchmarkConfig:
             require_choice("problem", problem, accepted=PROBLEMS)
         for measure in self.alone:
             require_choice("alone", measure, accepted=MEASURES)
+        for name in self.rows:
+            require_choice("rows", name, accepted=GROUPS)
 
     def shortened(self) -> BenchmarkConfig:
         """Return a configuration of less than a minute, whose times are not to be quoted."""
@@ -63,6 +74,7 @@ class BenchmarkConfig:
             repeats=2,
             package=replace(self.package, equation=()),
             steps=Steps(restarts=1, adam=50, search=10, long_search=20),
+            rows=tuple(name for name in self.rows if name in _QUICK),
         )
 
 
@@ -75,16 +87,16 @@ def main(config: DictConfig) -> None:
         checked = checked.shortened()
     torch.set_num_threads(1)
     console = Console(soft_wrap=True)
+    if checked.against is not None:
+        _compare_checkouts(checked, checked.against, values=values, console=console)
+        return
     with ExitStack() as stack:
         package = None
         if not checked.package.skip:
             python = interpreter(checked.package, console.print)
             package = stack.enter_context(PublishedPackage(python))
-        folder = make_run_folder(Path(checked.logs) / "benchmark", "drill")
-        write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
-        # Processes that ran or waited on average over the last minute.
-        busy = {"cores": os.cpu_count(), "load": os.getloadavg()[0]}
-        machine: dict[str, Any] = {**environment(), **busy}
+        folder = _run_folder(checked, "drill", values=values)
+        machine = _machine()
         if package is not None:
             machine["published"] = package.versions
         about: dict[str, Any] = {"settings": asdict(checked), "machine": machine}
@@ -95,7 +107,42 @@ def main(config: DictConfig) -> None:
                 for row in measured:
                     rows.append(row)
                     benchmark_report.write(folder, rows, about=about)
-    for line in benchmark_report.page(rows, about):
+    _show(console, benchmark_report.page(rows, about), folder=folder)
+
+
+def _compare_checkouts(
+    config: BenchmarkConfig, against: str, *, values: dict[str, Any], console: Console
+) -> None:
+    """Measure this checkout and another one in turn; what is measured so far is in its files."""
+    with comparison(against, config.repeats) as compared:
+        folder = _run_folder(config, "checkouts", values=values)
+        machine = _machine()
+        checkouts = {name: commit_of(side.folder) for name, side in compared.sides.items()}
+        about = {"settings": asdict(config), "machine": machine, "checkouts": checkouts}
+        rows: list[ComparedRow] = []
+        with console.status("") as status:
+            for name in config.rows:
+                status.update(f"measuring {name}")
+                for row in GROUPS[name](compared):
+                    rows.append(row)
+                    machine["load at the end"] = os.getloadavg()[0]
+                    benchmark_report.write_comparison(folder, rows, about=about)
+    _show(console, benchmark_report.comparison_page(rows, about), folder=folder)
+
+
+def _run_folder(config: BenchmarkConfig, name: str, *, values: dict[str, Any]) -> Path:
+    folder = make_run_folder(Path(config.logs) / "benchmark", name)
+    write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
+    return folder
+
+
+def _machine() -> dict[str, Any]:
+    # Processes that ran or waited on average over the last minute.
+    return {**environment(), "cores": os.cpu_count(), "load": os.getloadavg()[0]}
+
+
+def _show(console: Console, lines: list[str], *, folder: Path) -> None:
+    for line in lines:
         console.print(line)
     for path in sorted(folder.iterdir()):
         console.print(f"written: {path}")

@@ -30,12 +30,8 @@ from runners.evaluation.plan import Task, Trial
 from runners.evaluation.run_method import REPEAT_FOLDER
 from runners.evaluation.trial_configurations import chosen_names, chosen_seeds
 from runners.evaluation.trial_session import read_told
-from runners.published_package.process import (
-    PackageConfig,
-    PublishedPackage,
-    RefusedError,
-    interpreter,
-)
+from runners.published_package.process import PackageConfig, PublishedPackage, interpreter
+from runners.published_package.worker_process import RefusedError
 from runners.sessions.recorded import RecordedSettings, RecordedSource
 
 HOW = replace(in_preset(OnlineSettings(), "reference"), initial="so3")

@@ -7,28 +7,39 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from runners.benchmarks.checkouts import ComparedRow
 from runners.benchmarks.registrations import PACKAGE, WHAT, Row
 from runners.reporting.tables import number
 from runners.run.recording import write_in_run_folder
 
 _COMPARED = "registration"
 _VERSIONS = ("numpy", "torch", "numba")
+_WRITTEN = (
+    "Written by `python -m runners.benchmark`. `python -m runners.benchmark against=REF` compares "
+    "this code with that of another revision or folder, in turn: sessions and commands, too."
+)
+COMPARED = (
+    "Medians of pairs that were measured in turn. ratio: how many times as fast this checkout is "
+    "as the other one, or how many times as small, by pair: median and quartiles. processor: time "
+    "of the process and those it started, one thread each; wall: by the clock. costs: of the best "
+    "pose by the other and by this checkout, by Eq. 7 with nearest lookup."
+)
 
 
 def write(folder: Path, rows: Sequence[Row], *, about: Mapping[str, Any]) -> None:
     """Write all numbers as benchmark.json, and speed.md. about: machine and settings."""
     report = {**about, "rows": [row.mapping() for row in rows]}
     write_in_run_folder(folder / "benchmark.json", json.dumps(report, indent=2) + "\n")
-    lines = ["# Speed", "", "Written by `python -m runners.benchmark`.", "", *page(rows, about)]
+    lines = ["# Speed", "", _WRITTEN, "", *page(rows, about)]
     write_in_run_folder(folder / "speed.md", "\n".join(lines) + "\n")
 
 
 def page(rows: Sequence[Row], about: Mapping[str, Any]) -> list[str]:
     """Return the tables in Markdown, which a terminal shows as well."""
     machine = about["machine"]
-    versions = [f"{name} {machine[f'package {name}']}" for name in _VERSIONS]
-    lines = [f"{machine['processor']}, {machine['cores']} cores, load {machine['load']:.2f}", ""]
-    lines += [", ".join([f"Python {machine['python']}", *versions]), ""]
+    lines = _machine(machine)
     if "published" in machine:
         published = ", ".join(f"{name} {value}" for name, value in machine["published"].items())
         lines += [f"package: {published}", ""]
@@ -47,6 +58,50 @@ def page(rows: Sequence[Row], about: Mapping[str, Any]) -> list[str]:
         ]
         lines += [*_table(cells), ""]
     return lines
+
+
+def write_comparison(
+    folder: Path, rows: Sequence[ComparedRow], *, about: Mapping[str, Any]
+) -> None:
+    """Write all numbers of a comparison as benchmark.json, and comparison.md."""
+    report = {**about, "rows": [row.mapping() for row in rows]}
+    write_in_run_folder(folder / "benchmark.json", json.dumps(report, indent=2) + "\n")
+    text = "\n".join(["# Two checkouts", "", *comparison_page(rows, about)]) + "\n"
+    write_in_run_folder(folder / "comparison.md", text)
+
+
+def comparison_page(rows: Sequence[ComparedRow], about: Mapping[str, Any]) -> list[str]:
+    """Return the table of two checkouts in Markdown."""
+    checkouts = ", ".join(f"{name}: {commit}" for name, commit in about["checkouts"].items())
+    lines = [*_machine(about["machine"]), checkouts, "", COMPARED, ""]
+    if rows:
+        lines += [*_table([_compared(row) for row in rows]), ""]
+    missing = dict.fromkeys(f"{row.case}: {row.missing}" for row in rows if row.missing)
+    return [*lines, *(line for text in missing for line in (text, ""))]
+
+
+def _compared(row: ComparedRow) -> dict[str, str]:
+    line = {"measure": row.case, "unit": row.unit, "of": row.clock}
+    for name, readings in (("other", row.other), ("this", row.this)):
+        line[name] = number(float(np.median(row.numbers(readings)))) if readings else "-"
+    ratios = row.ratios.tolist()
+    quartiles = np.quantile(ratios, [0.25, 0.75]).tolist() if len(ratios) > 1 else []
+    return {
+        **line,
+        "ratio": number(float(np.median(ratios))) if ratios else "",
+        "quartiles": "-".join(map(number, quartiles)),
+        "pairs": str(len(ratios)),
+        "costs": ", ".join(map(number, row.costs)),
+    }
+
+
+def _machine(machine: Mapping[str, Any]) -> list[str]:
+    load = f"load {machine['load']:.2f}"
+    if "load at the end" in machine:
+        load += f", {machine['load at the end']:.2f} at the end"
+    versions = [f"{name} {machine[f'package {name}']}" for name in _VERSIONS]
+    lines = [f"{machine['processor']}, {machine['cores']} cores, {load}", ""]
+    return [*lines, ", ".join([f"Python {machine['python']}", *versions]), ""]
 
 
 def slower(rows: Sequence[Row], row: Row, *, package: str) -> float | None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -21,6 +19,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import settings_mapping
 from runners.command.choices import store
+from runners.published_package.worker_process import WorkerError, WorkerProcess, last_line
 
 PUBLISHED = "0.2.1"
 
@@ -73,51 +72,36 @@ def _run(what: str, command: list[str]) -> None:
         )
 
 
-def last_line(text: str) -> str:
-    """Return the last line of an error output."""
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    errors = [line for line in lines if line.startswith("ERROR:")]
-    return (errors or lines or ["no message"])[-1]
-
-
 _WORKER = Path(__file__).with_name("worker.py")
 _ACCEPTED = f"accepted: an interpreter that has chsel=={PUBLISHED}, or package.skip=true"
 
 
-class RefusedError(PackageError):
-    """The package cannot do what it was asked for; its process goes on."""
-
-
-class PublishedPackage:
+class PublishedPackage(WorkerProcess):
     """A process that registers with the package, one request at a time."""
 
     def __init__(self, python: Path) -> None:
         """Use an interpreter; raise PackageError if it does not have the package."""
         self._warm = False
+        # -I: no chsel but the installed one.
+        command = [str(python), "-I", str(_WORKER)]
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
-        self._printed = tempfile.TemporaryFile()  # noqa: SIM115  (closed by close)
         try:
-            self._process = subprocess.Popen(
-                [str(python), "-I", str(_WORKER)],  # -I: no chsel but the installed one
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=self._printed,
-                env=environment,
-                text=True,
-            )
+            super().__init__(command, environment)
         except OSError as error:
             raise PackageError(
                 f"package.python {python} does not run ({error.strerror}); {_ACCEPTED}"
             ) from None
-        try:
-            self.versions = self._answer()
-            if self.versions["chsel"] != PUBLISHED:
-                raise PackageError(f"it has chsel {self.versions['chsel']}")
-        except PackageError as error:
-            self.close()
+        except WorkerError as error:
             raise PackageError(
                 f"{python} cannot use the published package: {error}; {_ACCEPTED}"
             ) from None
+        self.versions = self.description
+        if self.versions["chsel"] != PUBLISHED:
+            self.close()
+            raise PackageError(
+                f"{python} cannot use the published package: it has chsel "
+                f"{self.versions['chsel']}; {_ACCEPTED}"
+            )
 
     def load(self, problem: RegistrationProblem, object_bounds: FloatArray) -> None:
         """Hand a problem over; object_bounds (2, 3): of the mesh, in its frame, metres."""
@@ -146,37 +130,3 @@ class PublishedPackage:
             self.ask("register", **arguments)
             self._warm = True
         return self.ask("register", **arguments)
-
-    def ask(self, task: str, **arguments: Any) -> dict[str, Any]:
-        """Have the process do a task (a method of the worker's) and return its answer."""
-        assert self._process.stdin is not None
-        with suppress(BrokenPipeError):  # the missing answer says more
-            self._process.stdin.write(json.dumps({"task": task, **arguments}) + "\n")
-            self._process.stdin.flush()
-        return self._answer()
-
-    def _answer(self) -> dict[str, Any]:
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            self._printed.seek(0)
-            printed = self._printed.read().decode(errors="replace")
-            raise PackageError(f"its process ended: {last_line(printed)}")
-        answer: dict[str, Any] = json.loads(line)
-        if "error" in answer:
-            text = " ".join(answer["error"].split())
-            hint = "; on Debian, apt install libusb-1.0-0" if "libusb" in text else ""
-            raise RefusedError(f"{text}{hint}")
-        return answer
-
-    def close(self) -> None:
-        """End the process."""
-        self._process.kill()
-        self._process.communicate()
-        self._printed.close()
-
-    def __enter__(self) -> PublishedPackage:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

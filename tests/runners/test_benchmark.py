@@ -27,8 +27,9 @@ from runners.benchmarks.registrations import (
     pose,
     standing,
 )
-from runners.published_package.process import PackageError, PublishedPackage
+from runners.published_package.process import PublishedPackage
 from runners.published_package.worker import GridSdf
+from runners.published_package.worker_process import RefusedError
 from tests.runners.in_process import run as in_process
 
 FEW = ("quick=true", "repeats=2")
@@ -211,7 +212,7 @@ def test_the_worker_does_all_steps_of_the_package_and_counts_them(stand_in, prob
             np.testing.assert_allclose(answer["poses"], problem.initial_set, atol=1e-6)
         answer = package.register(seed=0)  # with all that is the package's own
         assert (answer["gradients"], len(answer["poses"])) == (None, 4)
-        with pytest.raises(PackageError, match=r"FileNotFoundError.*nothing\.npz"):
+        with pytest.raises(RefusedError, match=r"FileNotFoundError.*nothing\.npz"):
             package.ask("load", problem="nothing.npz")
         package.load(problem, drill(1.0)[0].bounds)  # an error ends nothing
 

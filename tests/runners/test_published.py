@@ -12,8 +12,8 @@ from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.mcap.reader import read_recording
 from runners import evaluate, published
-from runners.published_package.process import RefusedError
 from runners.published_package.worker import Worker
+from runners.published_package.worker_process import RefusedError
 from tests.runners.in_process import run
 from tests.runners.test_evaluate import SMALL, table
 
