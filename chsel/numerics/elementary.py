@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import factorial
-from typing import Any
 
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.compiler import compiled, leaf
+from chsel.numerics.compiler import compiled, leaf, spliced
 
 _HALF_PI = 1.5707963267948966
 _HALF_PI_TAIL = 6.123233995736766e-17  # pi/2 - _HALF_PI
@@ -45,8 +44,6 @@ _LOG = tuple(2.0 / (2 * k + 1) for k in range(10, 0, -1))  # of s^(2k - 2)
 _ARCTANGENT = tuple(_alternating(k) / (2 * k + 1) for k in range(13, 0, -1))  # of r^(2k - 2)
 _ARCTANGENT_HALF = 0.4636476090008061
 _ARCTANGENT_HALF_TAIL = 2.2698777452961687e-17
-
-_SIGNS = np.array([1, 1, -1, -1, 1, 1], dtype=np.float32)  # of sines in quarters of a turn
 
 _MANTISSA = (1 << 52) - 1
 _HEAD = ~((1 << 27) - 1)
@@ -201,6 +198,28 @@ def sine_cosine(x: float) -> tuple[float, float]:
     return -cosine, sine
 
 
+@spliced
+def sine_cosine_of_share(share: float) -> tuple[float, float]:
+    """Return sine and cosine of a share of a turn, 0 to 1, to 1e-15, without a branch."""
+    quarters = np.rint(4.0 * share)
+    r = (4.0 * share - quarters) * _HALF_PI
+    z = r * r
+    # A loop over the coefficients is not made into vector instructions.
+    c9, c8, c7, c6, c5, c4, c3, c2 = _SINE
+    sine = r + r * z * (
+        ((((((c9 * z + c8) * z + c7) * z + c6) * z + c5) * z + c4) * z + c3) * z + c2
+    )
+    d8, d7, d6, d5, d4, d3, d2 = _COSINE
+    fourth = (((((d8 * z + d7) * z + d6) * z + d5) * z + d4) * z + d3) * z + d2
+    cosine = (1.0 - 0.5 * z) + z * z * fourth
+    odd = (quarters == 1.0) | (quarters == 3.0)
+    below = (quarters == 2.0) | (quarters == 3.0)
+    left = (quarters == 1.0) | (quarters == 2.0)
+    first = cosine if odd else sine
+    second = sine if odd else cosine
+    return -first if below else first, -second if left else second
+
+
 @compiled
 def _quotient(n: float, d: float, d_tail: float) -> tuple[float, float]:
     """Return q + tail = n / (d + d_tail), from the remainder by products of half-length factors."""
@@ -305,19 +324,6 @@ def sines_cosines(x: FloatArray | float) -> tuple[FloatArray, FloatArray]:
     """Return sin x and cos x, each of the shape of x."""
     sine, cosine = _filled(_fill_sines_cosines, x, outputs=2)
     return sine, cosine
-
-
-def sines_cosines_of_turns(shares: Any) -> tuple[Any, Any]:
-    """Return sines and cosines of shares of a turn in 32 bits, to about seven digits (Taylor)."""
-    quarters = 4 * shares
-    nearest = (quarters + np.float32(0.5)).astype(np.int32)
-    r = (quarters - nearest.astype(np.float32)) * np.float32(0.5 * np.pi)
-    z = r * r
-    sine = r + r * z * ((-1 / 5040 * z + 1 / 120) * z - 1 / 6)
-    cosine = 1 + z * (((1 / 40320 * z - 1 / 720) * z + 1 / 24) * z - 1 / 2)
-    odd = (nearest & 1).astype(np.bool_)
-    a, b = np.where(odd, cosine, sine), np.where(odd, sine, cosine)
-    return a * _SIGNS.take(nearest), b * _SIGNS.take(nearest + 1)
 
 
 def exps(x: FloatArray | float) -> FloatArray:

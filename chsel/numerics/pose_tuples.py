@@ -45,7 +45,7 @@ def matrix_of(rotation: FloatArray) -> Matrix:
 def decode(space, x):
     """Return the pose of a search vector."""
     if space.planar:
-        return _planar(space, x)
+        return planar_pose(space, x)
     p, q, r, u, v, w = _gram_schmidt(x)[:6]
     return p, q, r, u, v, w, q * w - r * v, r * u - p * w, p * v - q * u, x[6], x[7], x[8]
 
@@ -62,7 +62,7 @@ def _gram_schmidt(x):
 
 
 @leaf
-def _planar(space, x):
+def planar_pose(space, x):
     """Return R = Rot(a, theta) R_0 by Rodrigues' formula, t = o a + u e_u + v e_v."""
     sine, cosine = sine_cosine(x[0])
     turn = space.turning

@@ -114,6 +114,7 @@ _NONE, _ONE = np.uint64(0), np.uint64(1)
 _LOW, _HIGH = np.uint64(8), np.uint64(40)  # bits below the upper 24 of either half of a word
 _MASK = np.uint64(2**24 - 1)
 _UNIT = np.float32(2.0**-24)
+_SHARE = 2.0**-24
 
 
 class Stream(NamedTuple):
@@ -148,6 +149,27 @@ def _block(stream, number):
         a, b, c, d = r ^ b ^ low, s, p ^ d ^ high, q
         low, high = low + _KEY_STEPS[0], high + _KEY_STEPS[1]
     return a, b, c, d
+
+
+@leaf
+def uniforms_of_block(stream, number):
+    """Return the eight numbers of [0, 1), multiples of 2^-24, of a block by its number, from 0.
+
+    They are those of `Generator.random` for float32, from 8 `number` on.
+    """
+    a, b, c, d = _block(stream, number)
+    p, q = _shares(a)
+    r, s = _shares(b)
+    t, u = _shares(c)
+    v, w = _shares(d)
+    return p, q, r, s, t, u, v, w
+
+
+@leaf
+def _shares(word):
+    """Return the numbers of [0, 1) that the halves of a word make."""
+    low = np.float64(np.int64((word >> _LOW) & _MASK)) * _SHARE
+    return low, np.float64(np.int64(word >> _HIGH)) * _SHARE
 
 
 @leaf

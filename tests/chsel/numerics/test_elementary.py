@@ -18,6 +18,7 @@ from chsel.numerics.elementary import (
     log,
     logs,
     sine_cosine,
+    sine_cosine_of_share,
     sines_cosines,
 )
 
@@ -243,3 +244,20 @@ def test_diagonal_matrices_are_sorted_with_unit_vectors_and_nan_ends():
     np.testing.assert_array_equal(values, [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(vectors, np.eye(3)[:, [1, 2, 0]])
     assert np.isnan(eigen(np.full((3, 3), np.nan))[0]).all()
+
+
+@numba.njit
+def fill_of_shares(shares, out):
+    for n in range(len(shares)):
+        out[n, 0], out[n, 1] = sine_cosine_of_share(shares[n])
+
+
+def test_sines_and_cosines_of_shares_are_those_of_a_turn():
+    shares = np.concatenate([np.linspace(0.0, 1.0, 10_001), [0.125, 0.375, 0.625, 0.875]])
+    found = np.empty((len(shares), 2))
+    fill_of_shares(shares, found)
+    exact = [
+        [float(mpmath.sin(2 * mpmath.pi * mpmath.mpf(share))) for share in shares],
+        [float(mpmath.cos(2 * mpmath.pi * mpmath.mpf(share))) for share in shares],
+    ]
+    np.testing.assert_allclose(found.T, exact, rtol=0.0, atol=1e-15)
