@@ -6,12 +6,15 @@ a brick and the same brick turned by half are one mode of two basins.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.compiler import compiled
 from chsel.problem.poses import Poses
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.subset import farthest_points, surface_descriptors
+from chsel.problem.subset import farthest_points, squared_distance, surface_descriptors
 
 # Where these numbers are from: docs/anchored.md, "Numbers that are no settings".
 MODE_DISTANCE = 0.01  # metres between surfaces of different modes, at least
@@ -26,19 +29,39 @@ def basin_bests(
     Each is farther than a distance (metres) from all chosen before it, or turned against them.
     """
     surfaces = surface_descriptors(sdf, poses)
-    rotations = poses.rotations.reshape(-1, 9)
+    rotations = poses.rotations.reshape(-1, 9).copy()
     least_trace = 1.0 + 2.0 * np.cos(_BASIN_ANGLE)  # of the relative rotation
-    chosen: list[int] = []
-    left = np.ones(len(poses), dtype=bool)
-    while len(chosen) < most and left.any():
-        best = int(np.argmax(left))
-        chosen.append(best)
-        others = np.flatnonzero(left)
-        near = ((surfaces[others] - surfaces[best]) ** 2).mean(axis=1) <= distance**2
-        turned = (rotations[others] * rotations[best]).sum(axis=1) < least_trace
-        left[others[near & ~turned]] = False
-        left[best] = False
-    return np.array(chosen, dtype=np.int64)
+    chosen = np.empty(min(most, len(poses)), dtype=np.int64)
+    count = choose_basins(surfaces, rotations, distance**2, least_trace, chosen)
+    return chosen[:count]
+
+
+@compiled
+def choose_basins(surfaces: Any, rotations: Any, within: Any, least_trace: Any, chosen: Any) -> Any:
+    """Fill `chosen` with the first pose of each basin; return how many they are.
+
+    surfaces (N, D): descriptors, metres. rotations (N, 9). within: metres^2, of poses of a basin.
+    """
+    count = 0
+    for n in range(len(surfaces)):
+        if count == len(chosen):
+            break
+        is_new = True
+        for m in range(count):
+            other = chosen[m]
+            trace = 0.0
+            for i in range(9):
+                trace += rotations[n, i] * rotations[other, i]
+            if trace < least_trace:
+                continue
+            mean = squared_distance(surfaces[n], surfaces[other]) / surfaces.shape[1]
+            if mean <= within:
+                is_new = False
+                break
+        if is_new:
+            chosen[count] = n
+            count += 1
+    return count
 
 
 def has_new_mode(sdf: SdfGrid, old: Poses, *, new: Poses, count: int) -> bool:

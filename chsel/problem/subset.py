@@ -90,12 +90,12 @@ def choose_farthest(points: Any, first: Any, chosen: Any, squared: Any) -> None:
                 best = i if squared[i] > squared[best] else best
         chosen[n] = best
         for i in range(len(points)):
-            squared[i] = min(squared[i], _squared_distance(points[i], points[best]))
+            squared[i] = min(squared[i], squared_distance(points[i], points[best]))
         squared[best] = -1.0
 
 
 @leaf
-def _squared_distance(one: Any, other: Any) -> Any:
+def squared_distance(one: Any, other: Any) -> Any:
     """Return the squared distance of two points (d,), in eight sums side by side."""
     size, total = len(one), 0.0
     whole = size // 8 * 8
