@@ -12,32 +12,42 @@ from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_kernels import Model
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.free_kernels import is_apart, remember
-from chsel.numerics.arrays import FloatArray, scratch
+from chsel.numerics.arrays import FloatArray, IntArray, scratch
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp, log
-from chsel.numerics.near_points import NearPoints, gather, near_points_for, select, to_cells
-from chsel.numerics.pose_tuples import moved, pose_at, rigid, turned
+from chsel.numerics.near_points import NearPoints, gather, near_points_for, to_cells
+from chsel.numerics.pose_tuples import pose_at, rigid, turned
 from chsel.numerics.threads import parallel_for
+from chsel.problem.lookup_blocks import (
+    BEYOND,
+    CELL,
+    MOST,
+    SIZE,
+    S,
+    X,
+    Y,
+    Z,
+    block_of,
+    blocks_of,
+    distance_in_block,
+    distance_in_box_block,
+    gradient_in_block,
+    locate_block,
+)
 from chsel.problem.noise import EXTENT, LATER, SHARE, WRONG_NORMALS, NoiseModel
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses
 from chsel.problem.prior_kernels import Prior, prior_energy, prior_of
 from chsel.problem.registration_problem import RegistrationProblem
-from chsel.problem.sdf_lookup import (
-    cell_of,
-    distance_at,
-    distance_with_gradient,
-    value_between_nodes,
-)
+from chsel.problem.sdf_lookup import distance_at
 
 # Where these numbers are from: docs/anchored.md, "Numbers that are no settings".
 _ROWS_PER_LEVEL = 4.0  # of tables, in the least s_k
 _BEYOND = 6.0  # of the greatest s_k: residuals beyond cost no more
-_AT_ONCE = 16  # known points between two comparisons with the limit
+_AT_ONCE = 8  # known points between two comparisons with the limit
 _LEVELS = 8  # K of the likelihood, as kernels take constants from kernel files alone
 _LEAST_PRODUCT = 1e-300  # of densities, by the largest
 _LEAST_GRADIENT = 1e-12  # length of one that has a direction
-_ALL = -1  # instead of the number of packets that were gathered
 
 
 class Likelihood(NamedTuple):
@@ -89,9 +99,15 @@ def likelihood_of(noise: NoiseModel, known: KnownPoints, *, prior: Prior) -> Lik
 class Scratch(NamedTuple):
     """Scratch arrays of one thread."""
 
-    near: NearPoints  # the free points gathered
-    memory: FloatArray  # (12,), where the object was then, see remember and travel
-    levels: FloatArray  # (K,), products of densities, then posterior weights
+    near: NearPoints  # of the packets of free points
+    memory: FloatArray  # (12,), where the object was when they were gathered, see remember
+    levels: FloatArray  # (K,), posterior weights, up to a factor
+    known: FloatArray  # (B SIZE,), blocks of known points, where looked up last
+    free: (
+        FloatArray  # (C SIZE,), blocks of the free points gathered, where they were looked up last
+    )
+    deep: IntArray  # (S,), which of them cost something there
+    counts: IntArray  # (2,), how many are gathered, and how many cost something
 
 
 class Energy:
@@ -106,6 +122,7 @@ class Energy:
         self._cost = CompiledCost(problem.sdf, known, settings=settings, free_resolution=side)
         self._sdf = problem.sdf
         self._known = known
+        self._blocks = blocks_of(known.known)
         self._prior = prior_of(problem.prior, problem.sdf)
         self._set(noise)
 
@@ -122,7 +139,16 @@ class Energy:
     def scratch(self) -> Scratch:
         """Return scratch of one thread."""
         near = near_points_for(self.model.free.tree, 1)
-        return Scratch(near, scratch(12), levels=scratch(_LEVELS))
+        free = len(self.model.free.tree.order)
+        return Scratch(
+            near,
+            scratch(12),
+            levels=scratch(_LEVELS),
+            known=self._blocks.copy(),
+            free=np.empty(-(-free // MOST) * SIZE),
+            deep=np.empty(free, dtype=np.int64),
+            counts=scratch(2, dtype=np.int64),
+        )
 
     def of(self, poses: Poses) -> FloatArray:
         """Return energies (B,) of poses."""
@@ -140,62 +166,114 @@ def energies_of(model, likelihood, poses, out, first, last, work):
     """Fill out (B,) with the energies of poses (B, 12), from `first` to before `last`."""
     for n in range(first, last):
         pose = pose_at(poses, n)
-        known = known_energy(model, likelihood, pose, np.inf, work.levels)
+        known = known_energy(model, likelihood, pose, np.inf, work)
         gather_free(model, pose, 0.0, work)
         out[n] = energy_below(model, likelihood, pose, known, np.inf, work)[0]
 
 
 @leaf
-def known_energy(model, likelihood, pose, limit, levels):
+def known_energy(model, likelihood, pose, limit, work):
     """Return the energy of known points and of the prior; infinite if surely above a limit.
 
-    levels (K,) become the posterior weights of the levels of noise.
+    work.levels (K,) become the posterior weights of the levels of noise, up to a factor, and
+    work.known the places of known points.
     """
-    known = model.known
-    table = likelihood.densities
-    foreign = likelihood.foreign
+    count = model.known.shape[1]
+    field = model.field
     power = likelihood.power
-    count, size = known.shape[1], np.uint64(_LEVELS)
     offset = prior_energy(likelihood.prior, pose)
     if offset > limit:
         return np.inf
-    for k in range(size):
-        levels[k] = 1.0
-    for first in range(0, count, _AT_ONCE):
-        for n in range(first, min(first + _AT_ONCE, count)):
-            point = known[0, n], known[1, n], known[2, n]
-            s, factor = distance_and_factor(model, likelihood, pose, n, point)
-            at, part = _row(likelihood, s - model.known_sdf[n])
-            scale = likelihood.scales[n]
-            for k in range(size):
-                low = table[at + k]
-                density = low + part * (table[at + size + k] - low)
-                levels[k] *= scale * (density * factor + foreign)
-        largest = 0.0
-        for k in range(size):
-            largest = max(largest, levels[k])
+    least = exp((offset - limit) / power)  # density, as all are at most 1 by their scales
+    levels = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    for first in range(0, count, MOST):
+        size = min(MOST, count - first)
+        block = block_of(work.known, first)
+        locate_block(field.box, pose, block, size)
+        for start in range(0, size, _AT_ONCE):
+            for n in range(start, min(start + _AT_ONCE, size)):
+                s, factor = _distance_and_factor(model, likelihood, pose, first + n, block, n)
+                block[S + n] = s
+                at, part = _row(likelihood, s - model.known_sdf[first + n])
+                levels = _times_densities(levels, likelihood, at, part, factor, first + n)
+            if _largest(levels) < least:
+                return np.inf
+        largest = _largest(levels)
         offset -= power * log(largest)
-        if offset > limit:  # densities are at most 1 by their scales
+        if offset > limit:
             return np.inf
-        for k in range(size):
-            levels[k] /= largest
+        least = exp((offset - limit) / power)
+        levels = _times(levels, 1.0 / largest)
     total = 0.0
-    for k in range(size):
+    out = work.levels
+    for k in range(_LEVELS):
+        level = levels[k]
         if power < 1.0:
-            levels[k] = exp(power * log(max(levels[k], _LEAST_PRODUCT)))
-        levels[k] *= likelihood.weights[k]
-        total += levels[k]
-    for k in range(size):
-        levels[k] /= total
+            level = exp(power * log(max(level, _LEAST_PRODUCT)))
+        out[k] = level * likelihood.weights[k]
+        total += out[k]
     return offset - log(total)
 
 
 @leaf
-def distance_and_factor(model, likelihood, pose, n, point):
-    """Return the signed distance at the n-th known point, and the factor F of its normal."""
+def _times_densities(levels, likelihood, at, part, factor, n):
+    """Return levels times the densities of the n-th known point, whose residual has a row."""
+    table = likelihood.densities
+    foreign = likelihood.foreign
+    scale = likelihood.scales[n]
+    a, b, c, d, e, f, g, h = _eight(table, at)
+    p, q, r, s, t, u, v, w = _eight(table, at + np.uint64(_LEVELS))
+    return (
+        levels[0] * (scale * ((a + part * (p - a)) * factor + foreign)),
+        levels[1] * (scale * ((b + part * (q - b)) * factor + foreign)),
+        levels[2] * (scale * ((c + part * (r - c)) * factor + foreign)),
+        levels[3] * (scale * ((d + part * (s - d)) * factor + foreign)),
+        levels[4] * (scale * ((e + part * (t - e)) * factor + foreign)),
+        levels[5] * (scale * ((f + part * (u - f)) * factor + foreign)),
+        levels[6] * (scale * ((g + part * (v - g)) * factor + foreign)),
+        levels[7] * (scale * ((h + part * (w - h)) * factor + foreign)),
+    )
+
+
+@leaf
+def _eight(table, at):
+    """Return a row of a table, all loaded before anything is stored."""
+    return (
+        table[at],
+        table[at + np.uint64(1)],
+        table[at + np.uint64(2)],
+        table[at + np.uint64(3)],
+        table[at + np.uint64(4)],
+        table[at + np.uint64(5)],
+        table[at + np.uint64(6)],
+        table[at + np.uint64(7)],
+    )
+
+
+@leaf
+def _largest(levels):
+    a, b, c, d, e, f, g, h = levels
+    return max(max(max(a, b), max(c, d)), max(max(e, f), max(g, h)))
+
+
+@leaf
+def _times(levels, factor):
+    a, b, c, d, e, f, g, h = levels
+    return (
+        a * factor, b * factor, c * factor, d * factor,
+        e * factor, f * factor, g * factor, h * factor,
+    )  # fmt: skip
+
+
+@leaf
+def _distance_and_factor(model, likelihood, pose, n, block, at):
+    """Return the signed distance at the n-th known point, and the factor F of its normal.
+
+    at: its number in a block.
+    """
     if likelihood.variances[n] == 0.0:
-        return distance_at(model.field, pose, point[0], point[1], point[2]), 1.0
-    looked_up = distance_with_gradient(model.field, pose, point[0], point[1], point[2])
+        return distance_in_block(model.field, pose, block, at), 1.0
+    looked_up = gradient_in_block(model.field, pose, block, at)
     return looked_up[0], normal_beside(likelihood, pose, n, looked_up)[0]
 
 
@@ -276,70 +354,97 @@ def depth_slope(likelihood, depth, costs):
 def energy_below(model, likelihood, pose, known, limit, work):
     """Return an energy of `known_energy` plus that of occupied and of gathered free points.
 
-    It is infinite above a limit. Also return the sum of the costs of the latter.
+    It is infinite above a limit. Also return the sum of the costs of the latter. work.deep becomes
+    the free points that cost something, where the energy is not above the limit.
     """
     occupied = model.occupied
-    table = model.field.table
+    field = model.field
+    steps = model.free.cells.steps
+    alpha = model.alpha
+    deep = work.deep
     costs = 0.0
     for n in range(occupied.shape[1]):
-        s = distance_at(model.field, pose, occupied[0, n], occupied[1, n], occupied[2, n])
-        costs += _depth_cost(likelihood, max(s + model.alpha, 0.0))
-    across, along = np.int64(model.field.box.across), np.int64(model.field.box.along)
+        s = distance_at(field, pose, occupied[0, n], occupied[1, n], occupied[2, n])
+        costs += _depth_cost(likelihood, max(s + alpha, 0.0))
     total = known + _depth_energy(likelihood, costs)
-    for n in range(look_around(model, pose, work)):
+    count = work.counts[0]
+    found = 0
+    for first in range(0, count, MOST):
         if not total <= limit:
-            break
-        cell, u, v, w = free_cell(model, pose, free_point(model, work, n))
-        if cell >= 0:
-            s = value_between_nodes(table, cell, across, along, u, v, w)
-            costs += _depth_cost(likelihood, max(model.alpha - s, 0.0))
-            total = known + _depth_energy(likelihood, costs)
+            return np.inf, costs
+        size = min(MOST, count - first)
+        block = block_of(work.free, first)
+        locate_block(field.box, pose, block, size)
+        for n in range(size):
+            if block[BEYOND + n] == 0.0 and steps[np.uint64(np.int64(block[CELL + n]))] == 0:
+                depth = alpha - distance_in_box_block(field, block, n)
+                if depth > 0.0:
+                    costs += _depth_cost(likelihood, depth)
+                    deep[found] = first + n
+                    found += 1
+        total = known + _depth_energy(likelihood, costs)
+    work.counts[1] = found
     return total if total <= limit else np.inf, costs
 
 
 @inner
 def gather_free(model, pose, slack, work):
     """Gather the free points that can matter until the object moves by a slack, metres."""
-    free, points = model.free, work.near
+    free, near = model.free, work.near
+    points = free.tree.points
+    first = free.tree.first
     remember(free, pose, work.memory)
     to_cell, rounding = to_cells(free.tree, free.cells.box, pose)
-    if len(free.tree.order) == 0:
-        points.number[0] = 0
-    elif rounding < 0.0 or not rigid(pose):
-        points.number[0] = _ALL
-    elif is_apart(free, pose, slack + rounding):
-        points.number[0] = 0
-    else:
-        gather(free.tree, free.cells, to_cell, slack + rounding, points, 0)
+    total = len(free.tree.order)
+    count = 0
+    if rounding < 0.0 or not rigid(pose):
+        for at in range(total):
+            _put_point(points, at, work.free, count)
+            count += 1
+    elif total > 0 and not is_apart(free, pose, slack + rounding):
+        gather(free.tree, free.cells, to_cell, slack + rounding, near, 0)
+        for n in range(near.number[0]):
+            packet = near.kept[n]
+            end = first[packet + 1] if packet + 1 < len(first) else total
+            for at in range(first[packet], end):
+                _put_point(points, at, work.free, count)
+                count += 1
+        if slack > 0.0:
+            count = _keep_near(model, pose, slack, work.free, count)
+    work.counts[0] = count
 
 
 @leaf
-def look_around(model, pose, work):
-    """Fill hits with those gathered that may cost something at a pose; return their number."""
-    free, points = model.free, work.near
-    if points.number[0] == 0:
-        return 0
-    to_cell, rounding = to_cells(free.tree, free.cells.box, pose)
-    if points.number[0] != _ALL and rounding >= 0.0:
-        return select(free.tree, free.cells, to_cell, rounding, points, 0)
-    count = len(free.tree.order)
-    for at in range(count):
-        points.hits[at] = at
-    return count
+def _put_point(points, at, blocks, n):
+    """Set the n-th point of blocks."""
+    to = n // MOST * SIZE + n % MOST
+    blocks[to + X] = points[0, at]
+    blocks[to + Y] = points[1, at]
+    blocks[to + Z] = points[2, at]
 
 
-@leaf
-def free_point(model, work, n):
-    """Return the n-th of the hits: a point of the world."""
-    at, points = np.uint64(work.near.hits[n]), model.free.tree.points
-    return points[0, at], points[1, at], points[2, at]
+@inner
+def _keep_near(model, pose, slack, blocks, count):
+    """Keep those of `count` points that are within a slack of the object; return how many.
 
-
-@leaf
-def free_cell(model, pose, point):
-    """Return the lowest node of a point's cell, -1 if free points cost nothing, and fractions."""
-    x, y, z = moved(pose, point[0], point[1], point[2])
-    (cell, _, _, u, v, w), is_beyond = cell_of(model.field.box, x, y, z)
-    if is_beyond or model.free.cells.steps[np.uint64(cell)] > 0:
-        cell = -1
-    return cell, u, v, w
+    A point beyond the grid's box is at least as far from the object as the nearest of the box.
+    """
+    box = model.field.box
+    steps = model.free.cells.steps
+    reach = slack * (1.0 + 1e-9) + 1e-9
+    cells = reach * box.inverse
+    most = 1.0 + cells * cells
+    kept = 0
+    for first in range(0, count, MOST):
+        size = min(MOST, count - first)
+        block = block_of(blocks, first)
+        locate_block(box, pose, block, size)
+        for n in range(size):
+            cell = np.uint64(np.int64(block[CELL + n]))
+            if block[BEYOND + n] <= reach * reach and np.float64(steps[cell]) <= most:
+                to = kept // MOST * SIZE + kept % MOST
+                blocks[to + X] = block[X + n]
+                blocks[to + Y] = block[Y + n]
+                blocks[to + Z] = block[Z + n]
+                kept += 1
+    return kept

@@ -17,12 +17,9 @@ from chsel.methods.anchored.energy import (
     Scratch,
     depth_slope,
     energy_below,
-    free_cell,
-    free_point,
     gather_free,
     known_energy,
     known_slope,
-    look_around,
     normal_beside,
 )
 from chsel.numerics.arrays import FloatArray, scratch
@@ -30,9 +27,10 @@ from chsel.numerics.cell_set import triple
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import composed, moved, pose_at
 from chsel.numerics.threads import parallel_for
+from chsel.problem.lookup_blocks import MOST, S, X, Y, Z, block_of, gradient_in_block
 from chsel.problem.poses import Poses
 from chsel.problem.prior_kernels import add_prior
-from chsel.problem.sdf_lookup import distance_between_nodes, distance_with_gradient
+from chsel.problem.sdf_lookup import distance_with_gradient
 from chsel.problem.search_space import SE2Space, SearchSpace
 
 # Where these numbers are from: docs/anchored.md, "Numbers that are no settings".
@@ -44,7 +42,7 @@ _FIRST_DAMPING = 1e-2  # of the mean of the diagonal
 _LESS = 0.3  # factor of the damping after a step that lowered the energy
 _MORE = 5.0  # and after one that did not
 _MOST_DAMPING = 1e6
-_ENOUGH = 1e-4  # relative gain below which a pose has converged
+_ENOUGH = 1e-3  # relative gain below which a pose has converged
 
 
 class Twists(NamedTuple):
@@ -112,53 +110,63 @@ def fit_poses(model, likelihood, twists, poses, steps, first, last, fit):
             poses[n, i] = pose[i]
 
 
-@inner
+@leaf
 def _fitted(model, likelihood, twists, pose, steps, fit):
     """Return a pose after up to so many steps that lower its energy."""
-    dimension, damping = len(twists.basis), _FIRST_DAMPING
-    gather_free(model, pose, _SLACK, fit.work)
-    known = known_energy(model, likelihood, pose, np.inf, fit.work.levels)
-    energy, costs = energy_below(model, likelihood, pose, known, np.inf, fit.work)
-    _linearise(model, likelihood, twists, pose, costs, fit)
-    for _ in range(steps):
+    dimension = len(twists.basis)
+    damping = _FIRST_DAMPING
+    trial = pose
+    energy = np.inf
+    for step in range(steps + 1):
+        if step == 0 or travel(model.free, trial, fit.work.memory) > _SLACK:
+            gather_free(model, trial, _SLACK, fit.work)
+        known = known_energy(model, likelihood, trial, energy, fit.work)
+        tried, costs = energy_below(model, likelihood, trial, known, energy, fit.work)
+        if step == 0 or tried < energy:
+            gain = energy - tried
+            pose, energy = trial, tried
+            if step > 0:
+                damping *= _LESS
+            if step == steps or gain < _ENOUGH * tried:
+                break
+            _linearise(model, likelihood, twists, pose, costs, fit)
+        else:
+            damping *= _MORE
+            if step == steps or damping > _MOST_DAMPING:
+                break
         trace = 0.0
         for i in range(dimension):
             trace += fit.normal[i, i]
         if not _solve(fit, damping * trace / dimension + 1e-12):
             break
         trial = _moved_by(twists, pose, fit)
-        if travel(model.free, trial, fit.work.memory) > _SLACK:
-            gather_free(model, trial, _SLACK, fit.work)
-        known = known_energy(model, likelihood, trial, energy, fit.work.levels)
-        tried, costs = energy_below(model, likelihood, trial, known, energy, fit.work)
-        if tried < energy:
-            gain = energy - tried
-            pose, energy = trial, tried
-            damping *= _LESS
-            if gain < _ENOUGH * tried:
-                break
-            _linearise(model, likelihood, twists, pose, costs, fit)
-        else:
-            damping *= _MORE
-            if damping > _MOST_DAMPING:
-                break
     return pose
 
 
-@inner
+@leaf
 def _linearise(model, likelihood, twists, pose, costs, fit):
-    """Fill the normal equations at a pose; costs: of free and occupied points, see energy_below."""
+    """Fill the normal equations at a pose whose energy was the last that was computed.
+
+    costs: of free and occupied points, see energy_below.
+    """
     field = model.field
     sums = fit.sums
     work = fit.work
     for i in range(7):
         for j in range(6):
             sums[i, j] = 0.0
+    levels = work.levels
+    total = 0.0
+    for k in range(len(levels)):
+        total += levels[k]
+    for k in range(len(levels)):
+        levels[k] /= total
     add_prior(likelihood.prior, pose, twists.pivot, sums)
     for n in range(model.known.shape[1]):
+        block = block_of(work.known, n)
         point = model.known[0, n], model.known[1, n], model.known[2, n]
-        looked_up = distance_with_gradient(field, pose, point[0], point[1], point[2])
-        residual = looked_up[0] - model.known_sdf[n]
+        looked_up = gradient_in_block(field, pose, block, n % MOST)
+        residual = block[S + n % MOST] - model.known_sdf[n]
         factor = 1.0
         if likelihood.variances[n] > 0.0:
             factor, bend, normal, gradient = normal_beside(likelihood, pose, n, looked_up)
@@ -166,15 +174,14 @@ def _linearise(model, likelihood, twists, pose, costs, fit):
             _add_normal(sums, normal, gradient, chance * bend)
         slope = known_slope(likelihood, residual, factor, work.levels)[0]
         _add(sums, twists.pivot, pose, point, looked_up, residual, slope)
-    for n in range(look_around(model, pose, work)):
-        point = free_point(model, work, n)
-        cell, u, v, w = free_cell(model, pose, point)
-        if cell >= 0:
-            looked_up = distance_between_nodes(field.box, field.table, cell, u, v, w)
-            depth = model.alpha - looked_up[0]
-            if depth > 0.0:
-                slope = depth_slope(likelihood, depth, costs)
-                _add(sums, twists.pivot, pose, point, looked_up, -depth, slope)
+    for n in range(work.counts[1]):
+        block = block_of(work.free, work.deep[n])
+        at = work.deep[n] % MOST
+        point = block[X + at], block[Y + at], block[Z + at]
+        looked_up = gradient_in_block(field, pose, block, at)
+        depth = model.alpha - looked_up[0]
+        slope = depth_slope(likelihood, depth, costs)
+        _add(sums, twists.pivot, pose, point, looked_up, -depth, slope)
     for n in range(model.occupied.shape[1]):
         point = model.occupied[0, n], model.occupied[1, n], model.occupied[2, n]
         looked_up = distance_with_gradient(field, pose, point[0], point[1], point[2])

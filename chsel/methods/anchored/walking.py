@@ -134,7 +134,7 @@ def walk_below(model, likelihood, stride, floor, chains, stream, moves, first, l
             trial = _proposed(model, stride, pose, size, drawn[at : at + _DRAWS])
             accepted = False
             if origin_within(trial, stride.lower, stride.upper):
-                total = known_energy(model, likelihood, trial, limit, work.levels)
+                total = known_energy(model, likelihood, trial, limit, work)
                 if total <= limit:
                     wanted = _slack_for(size)
                     far = slack < 0.0 or travel(model.free, trial, work.memory) > slack
