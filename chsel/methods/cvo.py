@@ -424,7 +424,8 @@ def product_at(product, pose, places):
 @leaf
 def _value_in_place(box, values, places, n):
     """Return f at the n-th place, interpolated between the values (nodes,) of its cell's nodes."""
-    u, v, low, high = places.u[n], places.v[n], 1.0 - places.w[n], places.w[n]
+    u, v = places.u[n], places.v[n]
+    low, high = 1.0 - places.w[n], places.w[n]
     across, along = np.uint64(np.int64(box.across)), np.uint64(np.int64(box.along))
     at, next_node = np.uint64(places.cell[n]), np.uint64(1)
     a = low * values[at] + high * values[at + next_node]

@@ -33,7 +33,7 @@ PROBLEM = RegistrationProblem(
     initial_set=around_truth(8, 0.1, shift=0.01),
     workspace=WORKSPACE,
     free_resolution=SIDE,
-    key=StreamKey(3, 1),
+    key=StreamKey(5, 1),
 )
 
 
