@@ -42,7 +42,7 @@ class CoarseScore(NamedTuple):
     """Data of the coarse score: A known points, and P points inside of the object."""
 
     box: Box  # of the grid of signed distances
-    values: FloatArray  # (nodes,): signed distances, metres, float32
+    values: Any  # (nodes,): signed distances, metres, float32
     table: FloatArray  # (4 nodes,): the same, and gradients, of which normals read the latter
     known: Any  # (3, A), relative to an origin, metres, float32
     known_origin: Triple  # world, metres
@@ -119,7 +119,7 @@ def free_voxels(problem: RegistrationProblem, margin: float) -> VoxelGrid | None
     return VoxelGrid.around(free, side)
 
 
-def _values(sdf: SdfGrid) -> FloatArray:
+def _values(sdf: SdfGrid) -> Any:
     """Return signed distances (nodes,) in 32 bits, which a processor's cache has room for."""
     return sdf.values.astype(np.float32).reshape(-1)
 
