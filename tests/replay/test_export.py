@@ -174,7 +174,7 @@ def test_modes_are_those_of_the_recorded_beliefs(events, write):
 
 def test_modes_of_a_recording_without_beliefs_are_those_of_its_results():
     """Of a result that is wide there are none."""
-    recording = read_recording(REPOSITORY / "tests" / "replays" / "points_default_anchored.mcap")
+    recording = read_recording(REPOSITORY / "tests" / "replays" / "points_default_icp.mcap")
     measured = [event for event in recording.events() if isinstance(event, Measured)]
     modes = {event.step: event.values["modes"] for event in measured}
     assert modes == {2: 0.0, 3: 1.0}
