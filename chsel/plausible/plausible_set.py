@@ -27,6 +27,7 @@ from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.plausible.pose_scan import (
     MOST_MEMBERS,
     PoseGrid,
+    PoseScan,
     grid_around,
     plausible_stream,
     scan_grid,
@@ -256,17 +257,18 @@ def _nearly_plausible(grid: PoseGrid, cost: EvaluationCost, *, members: Plausibl
     changes = replace(cost.settings, combine="means", violation=violation, tolerance=tolerance)
     relaxed = EvaluationCost(cost.problem, changes)
     limit = relaxed.at(members.truth) + settings.distance
+    scan = PoseScan(relaxed, grid, limit=limit)
     most = max(1, MOST_MEMBERS // len(grid.positions))
     poses = []
     count = 0
     first = 0
     size = min(_FIRST_ROTATIONS, most)
     while first < len(grid.rotations) and count < _CANDIDATES:
-        part = replace(grid, rotations=grid.rotations[first : first + size])
-        index, _ = scan_grid(relaxed, part, limit=limit)
-        poses.append(part.poses(index))
+        last = min(first + size, len(grid.rotations))
+        index, _ = scan.poses_below(first, last)
+        poses.append(grid.poses(index))
         count = count + len(index)
-        first = first + size
+        first = last
         size = min(2 * size, most)
     return np.concatenate(poses)
 

@@ -52,18 +52,23 @@ class Offsets:
     z: Axis = ((0.0, 0.1, 15),)  # pieces along z
 
     def __post_init__(self) -> None:
-        counts = [sum(piece[2] for piece in axis) for axis in (self.x, self.y, self.z)]
+        counts = [sum(piece[2] for piece in axis) for axis in self.axes]
         if min(counts) < 1:
             raise SettingError(
                 f"offsets are {counts} along x, y and z; accepted: at least one along each"
             )
         require_at_most("the number of offsets", math.prod(counts), most=MOST_POSITIONS)
 
+    @property
+    def axes(self) -> tuple[Axis, Axis, Axis]:
+        """Pieces along x, y and z."""
+        return self.x, self.y, self.z
+
     def points(self) -> FloatArray:
         """Return the offsets (P, 3), those along z fastest."""
         axes = [
             np.concatenate([np.linspace(first, last, count) for first, last, count in axis])
-            for axis in (self.x, self.y, self.z)
+            for axis in self.axes
         ]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 

@@ -1,13 +1,14 @@
 """A grid of poses around the true one, and all its poses that cost less than a limit.
 
-A pose is rejected as soon as what the first known points cost at least is too much. Bounds allow
-for rounding, and every pose that remains gets its exact cost.
+A group of neighbouring positions is rejected as soon as what the first known points cost at least
+is too much all around its centre, then a pose of a group that remains by what they cost at its own
+position. Bounds allow for rounding, and every pose that remains gets its exact cost.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -15,13 +16,14 @@ import numpy as np
 from chsel.errors import EvaluationError, PoseError
 from chsel.numerics.arrays import FloatArray, IntArray, frozen
 from chsel.numerics.cell_set import node_of
-from chsel.numerics.compiler import compiled, leaf
+from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import pose_at, turned
 from chsel.numerics.threads import parallel_for
 from chsel.plausible.evaluation_cost import (
     EvaluationCost,
     EvaluationModel,
     EvaluationScratch,
+    Pose,
     cost_below,
     scratch_for,
 )
@@ -53,7 +55,8 @@ _ROTATIONS_PER_THREAD = 200
 _MOST_INFORMATIVE = 256  # known points that are put in order
 _ROUNDING = 1e-9  # share of a sum that is more than rounding changes
 _LEAST_OUTWARD = 1e-9  # of a gradient along the normal of a face, so that rounding is no matter
-_LANES = 32  # positions that are looked at together
+_LANES = 32  # groups, or positions of one, that are looked at together
+_GROUP_SIDES = (3, 3, 3)  # positions of a group along each axis, at most _LANES in all
 _FIRST_LOOK = 4000  # poses that show which costs are worth looking for
 _STREAM = 100  # of the plausible rotations' streams, and those after it
 
@@ -114,54 +117,65 @@ def scan_grid(cost: EvaluationCost, grid: PoseGrid, *, limit: float) -> tuple[In
 
     Raises EvaluationError if there are more than MOST_MEMBERS.
     """
-    points = cost.problem.points
-    count = len(grid.positions)
-    order = _most_informative_first(points.known)
-    margin = _ROUNDING * (limit * cost.model.divisors.known + np.abs(points.sdf).sum())
-    scan = Scan(
-        model=cost.model,
-        bounds=_bounds(cost.problem.sdf, cost.settings.lookup),
-        beyond=_beyond(cost.problem.sdf, cost.settings.outside),
-        rotations=Poses.of(inverse(compose(grid.rotations, np.zeros(3)))).numbers,
-        positions=grid.positions,
-        known=points.known[order].T.copy(),
-        known_sdf=points.sdf[order],
-        limit=limit,
-        known_limit=limit * cost.model.divisors.known + margin,
-    )
-    found: dict[int, list[tuple[IntArray, FloatArray]]] = {}
-    total = [0]
+    return PoseScan(cost, grid, limit=limit).poses_below(0, len(grid.rotations))
 
-    def run(first: int, last: int, buffer: ScanBuffer) -> None:
-        pieces = found[first] = []
-        while first < last and total[0] <= MOST_MEMBERS:
-            first, filled = scan_rotations(scan, first, last, buffer)
-            pieces.append((buffer.pose[:filled].copy(), buffer.cost[:filled].copy()))
-            total[0] += filled
 
-    def make_buffer() -> ScanBuffer:
-        return ScanBuffer(
-            cost_scratch=scratch_for(cost.model),
-            points=np.empty((3, len(order))),
-            shifts=np.zeros((3, count + _LANES)),
-            total=np.empty(_LANES),
-            beyond=np.empty(_LANES),
-            cell=np.empty(_LANES, dtype=np.int32),
-            pose=np.empty(count + _CAPACITY, dtype=np.int64),
-            cost=np.empty(count + _CAPACITY),
+class PoseScan:
+    """A scan of a grid for the poses that cost less than a limit."""
+
+    def __init__(self, cost: EvaluationCost, grid: PoseGrid, *, limit: float) -> None:
+        points = cost.problem.points
+        sdf = cost.problem.sdf
+        order = _most_informative_first(points.known)
+        margin = _ROUNDING * (limit * cost.model.divisors.known + np.abs(points.sdf).sum())
+        groups = position_groups(grid)
+        box = cost.model.field.box
+        self._cost = cost
+        self._scan = Scan(
+            model=cost.model,
+            groups=groups,
+            around_groups=_bounds_around(sdf, cost.settings.lookup, groups.radius * box.inverse),
+            around_poses=_bounds_around(sdf, cost.settings.lookup, 0.0),
+            beyond=_beyond(sdf, cost.settings.outside),
+            rotations=Poses.of(inverse(compose(grid.rotations, np.zeros(3)))).numbers,
+            known=points.known[order].T.copy(),
+            known_sdf=points.sdf[order],
+            limit=limit,
+            known_limit=limit * cost.model.divisors.known + margin,
         )
 
-    parallel_for(run, len(grid.rotations), scratch=make_buffer, least=_ROTATIONS_PER_THREAD)
-    pieces = [piece for first in sorted(found) for piece in found[first]]
-    index = np.concatenate([piece[0] for piece in pieces])
-    if len(index) > MOST_MEMBERS:
-        violation = cost.model.violation / cost.model.divisors.free
+    def poses_below(self, first: int, last: int) -> tuple[IntArray, FloatArray]:
+        """Return numbers and costs (G,) of the poses of these rotations, as scan_grid does."""
+        scan = self._scan
+        found: dict[int, list[tuple[IntArray, FloatArray]]] = {}
+        total = [0]
+
+        def run(start: int, stop: int, buffer: ScanBuffer) -> None:
+            pieces = found[start] = []
+            rotation = first + start
+            while rotation < first + stop and total[0] <= MOST_MEMBERS:
+                rotation, filled = scan_rotations(scan, rotation, first + stop, buffer)
+                pieces.append((buffer.pose[:filled].copy(), buffer.cost[:filled].copy()))
+                total[0] += filled
+
+        make_buffer = partial(scan_buffer, scan)
+        parallel_for(run, last - first, scratch=make_buffer, least=_ROTATIONS_PER_THREAD)
+        pieces = [piece for start in sorted(found) for piece in found[start]]
+        index = np.concatenate([piece[0] for piece in pieces])
+        if len(index) > MOST_MEMBERS:
+            self._raise_too_many()
+        costs = np.concatenate([piece[1] for piece in pieces])
+        ascending = np.argsort(index)
+        return index[ascending], costs[ascending]
+
+    def _raise_too_many(self) -> None:
+        model = self._cost.model
+        violation = model.violation / model.divisors.free
         raise EvaluationError(
-            f"more than {MOST_MEMBERS:_} poses cost less than {limit:.4g} with {points.count} "
-            f"known points (a violated point: {violation:.4g}); accepted: more known points, a "
-            "smaller epsilon or a larger cost.tolerance"
+            f"more than {MOST_MEMBERS:_} poses cost less than {self._scan.limit:.4g} with "
+            f"{self._cost.problem.points.count} known points (a violated point: {violation:.4g}); "
+            "accepted: more known points, a smaller epsilon or a larger cost.tolerance"
         )
-    return index, np.concatenate([piece[1] for piece in pieces])
 
 
 def _most_informative_first(known: FloatArray) -> IntArray:
@@ -173,17 +187,52 @@ def _most_informative_first(known: FloatArray) -> IntArray:
     return np.concatenate([first, rest[~np.isin(rest, first)]])
 
 
-def _bounds(sdf: SdfGrid, lookup: str) -> FloatArray:
-    """Return the least and the greatest distance (2, nodes) that the cell of each node reads, m."""
-    values = sdf.values
-    if lookup == "nearest":
-        return np.stack([values, values]).reshape(2, -1)
-    ends = np.pad(values, [(0, 1)] * 3, mode="edge")
-    nx, ny, nz = sdf.shape
-    corners = [ends[i : i + nx, j : j + ny, k : k + nz] for i, j, k in np.ndindex(2, 2, 2)]
-    rounding = 1e-12 * (1.0 + np.abs(values).max())  # of interpolation
-    least, greatest = np.minimum.reduce(corners), np.maximum.reduce(corners)
-    return np.stack([least - rounding, greatest + rounding]).reshape(2, -1)
+def position_groups(grid: PoseGrid) -> PositionGroups:
+    """Return the positions of a grid in groups of at most _LANES neighbours along all axes."""
+    counts = [sum(piece[2] for piece in axis) for axis in grid.offsets.axes]
+    of_axis = [np.arange(count) // side for count, side in zip(counts, _GROUP_SIDES, strict=True)]
+    i, j, k = np.meshgrid(*of_axis, indexing="ij")
+    group = (i * (1 + of_axis[1][-1]) + j) * (1 + of_axis[2][-1]) + k
+    number = np.argsort(group.reshape(-1), kind="stable")
+    first = np.concatenate([[0], np.cumsum(np.bincount(group.reshape(-1)))])
+    positions = grid.positions[number]
+    lowest = np.minimum.reduceat(positions, first[:-1])
+    highest = np.maximum.reduceat(positions, first[:-1])
+    radius = 0.5 * np.sqrt(((highest - lowest) ** 2).sum(axis=1)).max()
+    return PositionGroups(
+        centres=0.5 * (lowest + highest),
+        radius=float(radius) * (1.0 + _ROUNDING),
+        first=first,
+        positions=positions,
+        number=number,
+    )
+
+
+def _bounds_around(sdf: SdfGrid, lookup: str, nodes: float) -> FloatArray:
+    """Return the least and the greatest distance (N, 2) read within so many nodes of each cell, m.
+
+    N: the cells of the grid, each numbered by its lowest node.
+    """
+    reach = int(np.ceil(nodes + _ROUNDING)) if nodes else 0
+    return sdf.derived(("scan", lookup, reach), lambda: _found_bounds(sdf, lookup, reach))
+
+
+def _found_bounds(sdf: SdfGrid, lookup: str, reach: int) -> FloatArray:
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    least = greatest = sdf.values
+    if lookup != "nearest":
+        ends = np.pad(sdf.values, [(0, 1)] * 3, mode="edge")
+        nx, ny, nz = sdf.shape
+        corners = [ends[i : i + nx, j : j + ny, k : k + nz] for i, j, k in np.ndindex(2, 2, 2)]
+        rounding = 1e-12 * (1.0 + np.abs(sdf.values).max())  # of interpolation
+        least = np.minimum.reduce(corners) - rounding
+        greatest = np.maximum.reduce(corners) + rounding
+    if reach:
+        side = 2 * reach + 1
+        least = minimum_filter(least, side, mode="nearest")
+        greatest = maximum_filter(greatest, side, mode="nearest")
+    return np.stack([least, greatest], axis=-1).reshape(-1, 2)
 
 
 def _beyond(sdf: SdfGrid, outside: str) -> tuple[float, float]:
@@ -198,18 +247,39 @@ def _beyond(sdf: SdfGrid, outside: str) -> tuple[float, float]:
     return (1.0, 0.0) if outside == "bounding_box" else (outward, outward)
 
 
+class PositionGroups(NamedTuple):
+    """Positions of a grid in groups of neighbours."""
+
+    centres: FloatArray  # (G, 3), world
+    radius: float  # metres, of a ball around each centre that holds the group
+    first: IntArray  # (G + 1,) where each group begins among the positions, and their count
+    positions: FloatArray  # (P, 3), world, group by group
+    number: IntArray  # (P,) of each position on the grid
+
+
 class Scan(NamedTuple):
     """Data of a scan of every rotation with every position."""
 
     model: EvaluationModel  # of the evaluation cost
-    bounds: FloatArray  # (2, nodes), see _bounds
+    groups: PositionGroups  # all positions
+    around_groups: FloatArray  # (N, 2), see _bounds_around, within a group's radius
+    around_poses: FloatArray  # (N, 2), of the cell itself
     beyond: tuple[float, float]  # see _beyond
     rotations: FloatArray  # (R, 12), object_from_world, of poses at the origin
-    positions: FloatArray  # (P, 3), world
     known: FloatArray  # (3, M), world, the most informative first
     known_sdf: FloatArray  # (M,), m
     limit: float  # costs are below it
     known_limit: float  # more than the sum over known points of any such pose, m
+
+
+class Lanes(NamedTuple):
+    """Groups, or positions, that are looked at together with one rotation."""
+
+    shifts: FloatArray  # (3, _LANES) translations of poses, m
+    total: FloatArray  # (_LANES,) lower bounds of sums over known points, m
+    beyond: FloatArray  # (_LANES,) distances to the box of the grid, m, squared
+    depth: FloatArray  # (_LANES,) distances to the nearest face of that box, below 0 outside, m
+    cell: Any  # (_LANES,) int32
 
 
 class ScanBuffer(NamedTuple):
@@ -217,12 +287,33 @@ class ScanBuffer(NamedTuple):
 
     cost_scratch: EvaluationScratch  # of the evaluation cost
     points: FloatArray  # (3, M) turned known points, m
-    shifts: FloatArray  # (3, P + _LANES) translations of poses, m
-    total: FloatArray  # (_LANES,) lower bounds of sums over known points, m
-    beyond: FloatArray  # (_LANES,) squared distances to the box of the grid, m^2
-    cell: Any  # (_LANES,) int32
+    groups: Lanes  # that are looked at
+    poses: Lanes  # of one group
     pose: IntArray  # (C,) numbers of poses
     cost: FloatArray  # (C,)
+
+
+def scan_buffer(scan: Scan) -> ScanBuffer:
+    """Return the buffer of one thread."""
+    capacity = len(scan.groups.positions) + _CAPACITY
+    return ScanBuffer(
+        cost_scratch=scratch_for(scan.model),
+        points=np.empty_like(scan.known),
+        groups=_lanes(),
+        poses=_lanes(),
+        pose=np.empty(capacity, dtype=np.int64),
+        cost=np.empty(capacity),
+    )
+
+
+def _lanes() -> Lanes:
+    return Lanes(
+        shifts=np.zeros((3, _LANES)),
+        total=np.empty(_LANES),
+        beyond=np.empty(_LANES),
+        depth=np.empty(_LANES),
+        cell=np.empty(_LANES, dtype=np.int32),
+    )
 
 
 @compiled
@@ -232,43 +323,77 @@ def scan_rotations(scan: Scan, first: int, last: int, buffer: ScanBuffer) -> tup
     Returns the rotation to go on with, before `last` where the buffer may be too small, and the
     number of poses in the buffer.
     """
-    known, positions = scan.known, scan.positions
+    known = scan.known
     points = buffer.points
-    shifts = buffer.shifts
-    total = buffer.total
+    groups = scan.groups
+    all_positions = len(groups.positions)
+    all_groups = len(groups.centres)
     count = 0
     for n in range(first, last):
-        if len(buffer.pose) - count < len(positions):
+        if len(buffer.pose) - count < all_positions:
             return n, count
         rotation = pose_at(scan.rotations, n)
         for m in range(known.shape[1]):
             x, y, z = turned(rotation, known[0, m], known[1, m], known[2, m])
             points[0, m], points[1, m], points[2, m] = x, y, z
-        for i in range(len(positions)):
-            x, y, z = turned(rotation, positions[i, 0], positions[i, 1], positions[i, 2])
-            shifts[0, i], shifts[1, i], shifts[2, i] = -x, -y, -z
-        for start in range(0, len(positions), _LANES):
-            if not _may_be_below(scan, buffer, start):
+        for start in range(0, all_groups, _LANES):
+            stop = min(start + _LANES, all_groups)
+            _put(rotation, groups.centres, start, stop, buffer.groups)
+            bounds = scan.around_groups
+            if not _may_be_below(scan, bounds, groups.radius, points, buffer.groups, stop - start):
                 continue
-            for i in range(start, min(start + _LANES, len(positions))):
-                if total[i - start] <= scan.known_limit:
-                    pose = (*rotation[:9], shifts[0, i], shifts[1, i], shifts[2, i])
-                    cost = cost_below(scan.model, pose, scan.limit, buffer.cost_scratch)
-                    if cost < scan.limit:
-                        buffer.pose[count] = n * len(positions) + i
-                        buffer.cost[count] = cost
-                        count += 1
+            for g in range(start, stop):
+                if buffer.groups.total[g - start] <= scan.known_limit:
+                    count = _scan_group(scan, n, rotation, g, buffer, count)
     return last, count
 
 
+@inner
+def _scan_group(
+    scan: Scan, n: int, rotation: Pose, group: int, buffer: ScanBuffer, count: int
+) -> int:
+    """Collect the poses of the n-th rotation in a group; return how many are in the buffer now."""
+    groups = scan.groups
+    poses = buffer.poses
+    shifts = poses.shifts
+    first, last = groups.first[group], groups.first[group + 1]
+    _put(rotation, groups.positions, first, last, poses)
+    if not _may_be_below(scan, scan.around_poses, 0.0, buffer.points, poses, last - first):
+        return count
+    for i in range(last - first):
+        if poses.total[i] <= scan.known_limit:
+            pose = (*rotation[:9], shifts[0, i], shifts[1, i], shifts[2, i])
+            cost = cost_below(scan.model, pose, scan.limit, buffer.cost_scratch)
+            if cost < scan.limit:
+                buffer.pose[count] = n * len(groups.positions) + groups.number[first + i]
+                buffer.cost[count] = cost
+                count += 1
+    return count
+
+
 @leaf
-def _may_be_below(scan: Scan, buffer: ScanBuffer, start: int) -> bool:
-    """Fill buffer.total for positions from `start` on; False as soon as all are too high."""
-    total = buffer.total
+def _put(rotation: Pose, positions: FloatArray, first: int, last: int, lanes: Lanes) -> None:
+    """Fill the lanes' translations, of poses with a rotation at positions (P, 3) from `first`."""
+    shifts = lanes.shifts
+    for i in range(last - first):
+        at = first + i
+        x, y, z = turned(rotation, positions[at, 0], positions[at, 1], positions[at, 2])
+        shifts[0, i], shifts[1, i], shifts[2, i] = -x, -y, -z
+
+
+@leaf
+def _may_be_below(
+    scan: Scan, bounds: FloatArray, radius: float, points: FloatArray, lanes: Lanes, count: int
+) -> bool:
+    """Fill the totals of lanes; False as soon as all of the first `count` are too high.
+
+    points (3, M): turned. radius: metres around a lane's translation for which bounds (N, 2) hold.
+    """
+    total = lanes.total
     for i in range(_LANES):
-        total[i] = 0.0
-    for m in range(buffer.points.shape[1]):
-        _add_bounds(scan, buffer, start, m)
+        total[i] = 0.0 if i < count else np.inf
+    for m in range(points.shape[1]):
+        _add_bounds(scan, bounds, radius, points, m, lanes)
         left = 0
         for i in range(_LANES):
             left += 1 if total[i] <= scan.known_limit else 0
@@ -278,26 +403,31 @@ def _may_be_below(scan: Scan, buffer: ScanBuffer, start: int) -> bool:
 
 
 @leaf
-def _add_bounds(scan: Scan, buffer: ScanBuffer, start: int, m: int) -> None:
-    """Add what the m-th known point costs at least at positions from `start` on."""
+def _add_bounds(
+    scan: Scan, bounds: FloatArray, radius: float, points: FloatArray, m: int, lanes: Lanes
+) -> None:
+    """Add what the m-th known point costs at least within the radius of every lane."""
     box = scan.model.field.box
-    bounds = scan.bounds
-    shifts = buffer.shifts
-    beyond = buffer.beyond
-    cell = buffer.cell
-    total = buffer.total
+    beyond = lanes.beyond
+    depth = lanes.depth
+    cell = lanes.cell
+    total = lanes.total
     first = box.first
     last = box.last
     most = box.most
     inverse = box.inverse
-    x, y, z = buffer.points[0, m], buffer.points[1, m], buffer.points[2, m]
-    us, vs, ws = shifts[0, start:], shifts[1, start:], shifts[2, start:]
+    x, y, z = points[0, m], points[1, m], points[2, m]
+    us, vs, ws = lanes.shifts[0], lanes.shifts[1], lanes.shifts[2]
     for i in range(_LANES):
         a, b, c = x + us[i], y + vs[i], z + ws[i]
         d = min(max(first[0], a), last[0])
         e = min(max(first[1], b), last[1])
         f = min(max(first[2], c), last[2])
         beyond[i] = (a - d) * (a - d) + (b - e) * (b - e) + (c - f) * (c - f)
+        depth[i] = min(
+            min(min(a - first[0], last[0] - a), min(b - first[1], last[1] - b)),
+            min(c - first[2], last[2] - c),
+        )
         d = node_of((d - first[0]) * inverse, box.between, most[0])
         e = node_of((e - first[1]) * inverse, box.between, most[1])
         f = node_of((f - first[2]) * inverse, box.between, most[2])
@@ -305,11 +435,19 @@ def _add_bounds(scan: Scan, buffer: ScanBuffer, start: int, m: int) -> None:
     value, weights = scan.known_sdf[m], scan.beyond
     for i in range(_LANES):
         at = np.uint64(cell[i])
-        least, greatest = bounds[0, at], bounds[1, at]
+        least, greatest = bounds[at, 0], bounds[at, 1]
         inside = max(least - value, value - greatest)
         least = max(least, 0.0)
-        outside = np.sqrt(weights[0] * beyond[i] + weights[1] * (least * least)) - value
-        total[i] += max(outside if beyond[i] > 0.0 else inside, 0.0)
+        way = max(np.sqrt(beyond[i]) - radius, 0.0)
+        outside = np.sqrt(weights[0] * (way * way) + weights[1] * (least * least)) - value
+        # Within the radius of a lane near the boundary of the box are points on both sides.
+        if depth[i] >= radius:
+            bound = inside
+        elif way > 0.0:
+            bound = outside
+        else:
+            bound = min(inside, outside)
+        total[i] += max(bound, 0.0)
 
 
 @dataclass(frozen=True)

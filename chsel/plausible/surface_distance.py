@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from chsel.errors import PoseError, SettingError
-from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.cell_set import locate, places_for
 from chsel.numerics.compiler import compiled
 from chsel.numerics.pose_tuples import composed, pose_at
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 METHODS = ("nearest", "exact", "grid")
 SQUARE_MILLIMETRES = 1e6  # in a square metre
 _CANDIDATES = 4  # of each pose, which the grid says are the nearest of the other set
+_POINTS_TO_GIVE_UP = (25, 100, 250)  # after which a pair that is too far is given up
 _POINTS_AT_ONCE = 200_000
 _MOST_POINTS = 1_000_000
 
@@ -78,19 +79,23 @@ class SurfaceDistance:
     def between(self, object_from_world: FloatArray, world_from_object: FloatArray) -> FloatArray:
         """Return d (B, P) in mm^2 of estimates (B, 4, 4) and plausible poses (P, 4, 4).
 
-        With method "nearest", the least of every row and column are exact, others are the grid's.
+        With method "nearest", the least of every row and column are exact; others are the grid's,
+        or where that is too low a bound above the least.
         """
         to_object, to_world = _finite(object_from_world), _finite(world_from_object)
         if self.settings.method == "exact":
-            count, other = len(to_object), len(to_world)
-            rows, columns = np.indices((count, other)).reshape(2, -1)
-            return self._exact(to_object, to_world, rows=rows, columns=columns).reshape(
-                count, other
-            )
+            pairs = np.ones((len(to_object), len(to_world)), dtype=bool)
+            return self._exact(to_object, to_world, pairs=pairs).reshape(pairs.shape)
         distances = self._by_grid(Poses.of(to_object).numbers, Poses.of(to_world).numbers)
         if self.settings.method == "nearest" and distances.size:
-            rows, columns = _nearest(distances)
-            distances[rows, columns] = self._exact(to_object, to_world, rows=rows, columns=columns)
+            first = _least(distances, 1)
+            others = _least(distances, _CANDIDATES) & ~first
+            distances[first] = self._exact(to_object, to_world, pairs=first)
+            known = np.where(first, distances, np.inf)
+            limit = np.maximum(known.min(axis=1)[:, None], known.min(axis=0))
+            found = self._exact(to_object, to_world, pairs=others, limit=limit)
+            given_up = found > limit[others]
+            distances[others] = np.where(given_up, np.maximum(distances[others], found), found)
         return distances
 
     def _by_grid(self, to_object: FloatArray, to_world: FloatArray) -> FloatArray:
@@ -101,21 +106,44 @@ class SurfaceDistance:
         return total * SQUARE_MILLIMETRES
 
     def _exact(
-        self, to_object: FloatArray, to_world: FloatArray, *, rows: IntArray, columns: IntArray
+        self,
+        to_object: FloatArray,
+        to_world: FloatArray,
+        *,
+        pairs: BoolArray,
+        limit: FloatArray | None = None,
     ) -> FloatArray:
-        """Return distances (N,) to the mesh of pairs of poses (B, 4, 4) and (P, 4, 4)."""
-        total = np.zeros(len(rows))
+        """Return distances (N,) to the mesh of flagged pairs (B, P) of poses, row by row.
+
+        limit (B, P), mm^2: of a pair that is farther, a lower bound above it, by fewer points.
+        """
+        rows, columns = np.nonzero(pairs)
         count = self._points.shape[1]
+        most = np.full(len(rows), np.inf) if limit is None else limit[rows, columns]
+        most = most * (count / SQUARE_MILLIMETRES)  # of the sum, m^2
+        stops = [count] if limit is None else [*(n for n in _POINTS_TO_GIVE_UP if n < count), count]
+        total = np.empty(len(rows))
         size = max(1, _POINTS_AT_ONCE // count)
-        for first in range(0, len(rows), size):
-            some = slice(first, first + size)
-            left, right = to_object[rows[some]], to_world[columns[some]]
-            turn = product(left[:, :3, :3], right[:, :3, :3])[:, None]
-            shift = rotated(left[:, :3, :3], right[:, :3, 3]) + left[:, :3, 3]
-            points = (rotated(turn, self._points.T) + shift[:, None]).reshape(-1, 3)
-            squared = self._tree.squared_distance(self._vertices, self._faces, points)[0]
-            total[some] = squared.reshape(-1, count).mean(axis=1)
+        for start in range(0, len(rows), size):
+            squares = np.zeros((min(size, len(rows) - start), count))
+            left = np.arange(len(squares))
+            first = 0
+            for stop in stops:
+                row, column = rows[start + left], columns[start + left]
+                points = self._points[:, first:stop]
+                squares[left, first:stop] = self._squared(to_object[row], to_world[column], points)
+                left = left[squares[left].sum(axis=1) <= most[start + left]]
+                first = stop
+            total[start : start + len(squares)] = squares.mean(axis=1)
         return total * SQUARE_MILLIMETRES
+
+    def _squared(self, left: FloatArray, right: FloatArray, points: FloatArray) -> FloatArray:
+        """Return squared distances (N, K) to the mesh, m^2, of points (3, K) moved by N pairs."""
+        turn = product(left[:, :3, :3], right[:, :3, :3])[:, None]
+        shift = rotated(left[:, :3, :3], right[:, :3, 3]) + left[:, :3, 3]
+        moved = (rotated(turn, points.T) + shift[:, None]).reshape(-1, 3)
+        squared = self._tree.squared_distance(self._vertices, self._faces, moved)[0]
+        return np.asarray(squared).reshape(len(left), points.shape[1])
 
 
 def surface_points(mesh: trimesh.Trimesh, count: int, *, key: StreamKey) -> FloatArray:
@@ -141,15 +169,14 @@ def _finite(transforms: FloatArray) -> FloatArray:
     return transforms
 
 
-def _nearest(distances: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return rows and columns (N,) of the few least entries of every row and of every column."""
-    near = np.zeros(distances.shape, dtype=bool)
+def _least(distances: FloatArray, most: int) -> BoolArray:
+    """Return flags (B, P) of at most so many least entries of every row and of every column."""
+    flags = np.zeros(distances.shape, dtype=bool)
     for axis in range(2):
-        count = min(_CANDIDATES, distances.shape[axis])
+        count = min(most, distances.shape[axis])
         least = np.argsort(distances, axis=axis, kind="stable").take(range(count), axis=axis)
-        np.put_along_axis(near, least, True, axis=axis)
-    rows, columns = np.nonzero(near)
-    return rows, columns
+        np.put_along_axis(flags, least, True, axis=axis)
+    return flags
 
 
 @compiled
