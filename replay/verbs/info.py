@@ -26,9 +26,10 @@ from chsel.events import Decided, Probe
 from chsel.problem.mesh import mesh_digest
 from chsel.problem.points import POINT_CLASSES
 from replay.console import Console, plain_table, print_error
+from replay.logs.mcap_log import ZSTD, Channel
+from replay.logs.rosbag import ROS1, SQLITE, open_log_file
 from replay.mcap.file import MALFORMED, McapFile, recover_hint
 from replay.mcap.foxglove_messages import TOPIC_SCHEMAS
-from replay.mcap.log_file import OTHER_LOGS, ROS1_BAG, Channel, RawFile
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.schemas import FORMAT_VERSION, PROFILE
 
@@ -157,7 +158,7 @@ def is_other_programs(path: str | Path) -> bool:
         return False
     try:
         with path.open("rb") as file:
-            if file.read(len(ROS1_BAG)).startswith((ROS1_BAG, *OTHER_LOGS)):
+            if file.read(len(ROS1)).startswith((ROS1, SQLITE, ZSTD)):
                 return True
             file.seek(0)
             header = next(StreamReader(file, record_size_limit=_LONGEST_HEADER).records, None)
@@ -167,12 +168,12 @@ def is_other_programs(path: str | Path) -> bool:
 
 
 def log_info(path: str | Path) -> dict[str, Any]:
-    """Return the contents of any program's MCAP file, by its summary or else by reading it all.
+    """Return the contents of any program's log file, by its summary or else by reading it all.
 
     begin and end: first and last log time, nanoseconds, 0 without messages; rate: messages a
-    second over that span. Raise SessionError for a file that cannot be read, or is not MCAP.
+    second over that span. Raise SessionError for a file that cannot be read, or is no log.
     """
-    file = RawFile(Path(path).expanduser())
+    file = open_log_file(Path(path).expanduser())
     faults = list[str]()
     counts: Counter[Channel] = Counter()
     times = file.times

@@ -50,7 +50,7 @@ class SensorsSettings(CheckedSettings):
     """A log of sensors, and what its topics are."""
 
     rig: Rig
-    path: str | None = None  # an .mcap file, a rosbag2 folder, or the YAML of a depth image
+    path: str | None = None  # .mcap, .db3, .bag, a folder of these, or a depth image's YAML
     pose: str | None = None
     """File of the true pose; None: that beside the log, if there is one; "none": unknown."""
     free_resolution: Annotated[float, positive] = 0.01  # side of a free voxel, m
@@ -67,8 +67,8 @@ class SensorsSettings(CheckedSettings):
         super().__post_init__()
         if not self.path:
             raise SettingError(
-                "path is missing; pass session.path=LOG, an .mcap file, a rosbag2 folder, or the "
-                ".yaml of a depth image"
+                "path is missing; pass session.path=LOG, an .mcap, .db3 or .bag file, a folder of "
+                "these, or the .yaml of a depth image"
             )
 
     @property

@@ -116,8 +116,7 @@ def _ros2_parser(name: str, definition: str | None) -> Callable[[bytes], Any]:
     try:
         parse = DecoderFactory().decoder_for("cdr", schema)
     except Exception as error:  # the parser raises whatever it stumbles over
-        advice = "; a ROS 1 bag is converted with --dst-typestore ros2_humble"
-        raise UnusableMessage(f"the definition of {name} is not read: {error}{advice}") from None
+        raise UnusableMessage(f"the definition of {name} is not read: {error}") from None
     assert parse is not None
     return parse
 

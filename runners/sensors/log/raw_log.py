@@ -1,4 +1,4 @@
-"""Raw logs of robots: MCAP files and rosbag2 folders, as messages that are decoded."""
+"""Raw logs of robots: MCAP files and bags of ROS, as messages that are decoded."""
 
 from __future__ import annotations
 
@@ -13,9 +13,12 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from chsel.errors import SessionError
 from replay.files import file_digest
-from replay.mcap.log_file import ACCEPTED, Channel, RawFile, RawMessage
+from replay.logs.mcap_log import ACCEPTED, Channel, RawFile, RawMessage
+from replay.logs.rosbag import RosbagFile, open_log_file
 from replay.mcap.texts import one_line
 from runners.sensors.log.decoding import decoder
 from runners.sensors.log.messages import Decode, Received, TransformMessage, UnusableMessage
@@ -24,6 +27,7 @@ Progress = Callable[[int, int], None]  # bytes so far, and of all
 
 _DIGEST_SIZE = 16  # bytes
 _MOST_LISTED = 60
+_SUFFIXES = (".mcap", ".db3", ".bag")
 _STATIC = "tf_static"  # what a topic of transforms that hold for all times ends with
 
 
@@ -54,7 +58,7 @@ class RawLog:
         self.faults = Counter()
         self.topics = {}
         self.files = log_files(self.path)
-        self._parts = [RawFile(file) for file in self.files]
+        self._parts = [open_log_file(file) for file in self.files]
         self.size = sum(part.size for part in self._parts)
         spans = [self._span(part, progress) for part in self._parts]
         times = [time for span in spans for time in span]
@@ -64,7 +68,8 @@ class RawLog:
     @property
     def warnings(self) -> list[str]:
         """Lines for the user on how the log is read; all of them once it has been."""
-        return [f"{part.path.name}: {remark}" for part in self._parts for remark in part.remarks]
+        of_files = [(part.path.name, remark) for part in self._parts for remark in part.remarks]
+        return [f"{name}: {remark}" for name, remark in [*_missing(self.path), *of_files]]
 
     def messages(
         self, topics: Collection[str], *, progress: Progress = lambda done, size: None
@@ -127,7 +132,7 @@ class RawLog:
         self.faults |= faults
         progress(self.size, self.size)
 
-    def _span(self, part: RawFile, progress: Progress) -> tuple[int, ...]:
+    def _span(self, part: RawFile | RosbagFile, progress: Progress) -> tuple[int, ...]:
         """Return first and last log time of a file, which is read through if it has no index."""
         span = part.times or ()
         if not part.is_indexed:
@@ -162,26 +167,50 @@ def _series(spans: list[tuple[int, ...]]) -> list[list[int]]:
 
 
 def log_files(path: Path) -> list[Path]:
-    """Return the MCAP files of a log, bag_2 before bag_10. Raise SessionError if there are none."""
+    """Return the files of a log, bag_2 before bag_10. Raise SessionError unless of one kind."""
     if not path.exists():
         raise SessionError(f"log {path} does not exist; {ACCEPTED}")
     if not path.is_dir():
         return [path]
-    found = sorted(path.glob("*.mcap"), key=_natural)
+    kinds = [suffix for suffix in _SUFFIXES if any(path.glob(f"*{suffix}"))]
+    found = sorted(path.glob(f"*{kinds[0]}"), key=_natural) if kinds else []
     names = {file.name for file in found}
-    packed = [file for file in path.glob("*.mcap.zst*") if file.stem not in names]
+    packed = [
+        file
+        for suffix in _SUFFIXES
+        for file in path.glob(f"*{suffix}.zst*")
+        if file.stem not in names
+    ]
     if packed:
         raise SessionError(
             f"log {path} has {len(packed)} files that are compressed, such as {packed[0].name}; "
             f"{ACCEPTED}: unpack them with `zstd -d FILE`, or convert it with `ros2 bag convert`"
         )
-    if not found:
-        other = " but .db3, of sqlite3" if any(path.glob("*.db3")) else ""
+    active = [file.name for file in path.glob("*.bag.active")]
+    if active:
         raise SessionError(
-            f"log {path} is a folder without .mcap files{other}; {ACCEPTED}: others are converted "
-            "by `ros2 bag convert`"
+            f"log {path} has {active[0]}, which was not finished; {ACCEPTED}: `rosbag reindex` "
+            "makes of it one that is"
         )
+    if len(kinds) != 1:
+        what = f"{' and '.join(kinds)} files" if kinds else "none of these files"
+        raise SessionError(f"log {path} is a folder with {what}; {ACCEPTED}")
     return found
+
+
+def _missing(folder: Path) -> list[tuple[str, str]]:
+    """Return names of files that a rosbag2 folder's metadata lists and it lacks, with a remark."""
+    try:
+        metadata = yaml.safe_load((folder / "metadata.yaml").read_text())
+        names = metadata["rosbag2_bagfile_information"]["relative_file_paths"]
+        files = [folder / Path(name).name.removesuffix(".zstd") for name in names]
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError):
+        return []  # there need not be any
+    return [
+        (file.name, "it is not there, though metadata.yaml lists it")
+        for file in files
+        if not file.exists()
+    ]
 
 
 def _natural(path: Path) -> list[Any]:

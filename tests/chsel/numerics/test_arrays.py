@@ -7,7 +7,7 @@ import pytest
 from chsel.errors import ChselError, PointsError, SessionError
 from chsel.numerics.arrays import read_npz, refuse_special_file
 from replay.files import file_digest
-from replay.mcap.log_file import RawFile
+from replay.logs.mcap_log import RawFile
 from replay.mcap.reader import read_recording
 from runners.sensors.log.images import read_image
 from runners.sensors.pose_file import read_yaml

@@ -26,17 +26,10 @@ from replay.mcap.file import (
 )
 from replay.mcap.texts import one_line
 
-ACCEPTED = "accepted: an .mcap file, or a rosbag2 folder with MCAP storage"
-ROS1_BAG = b"#ROSBAG "  # as long as MCAP0_MAGIC
-_CONVERT = (
-    "convert it with `pip install rosbags`, `rosbags-convert --src LOG.bag --dst LOG "
-    "--dst-storage mcap --dst-typestore ros2_humble`, and pass the folder LOG"
+ACCEPTED = (
+    "accepted: an .mcap, .db3 or .bag file of MCAP, rosbag2 or ROS 1, or a folder of one kind"
 )
-OTHER_LOGS = {
-    b"\x28\xb5\x2f\xfd": ("compressed by zstd", "unpack it with `zstd -d FILE`"),
-    b"SQLite f": ("a rosbag2 file in sqlite3", "convert its folder with `ros2 bag convert`"),
-}
-"""First bytes of logs of other kinds, with their name and what to do."""
+ZSTD = b"\x28\xb5\x2f\xfd"  # what a compressed file begins with
 _END_OF_TIME = 2**63
 _ROS_TEXTS = ("ros2msg", "ros1msg")
 
@@ -77,13 +70,13 @@ class RawFile:
         try:
             with path.open("rb") as file:
                 start = file.read(len(MCAP0_MAGIC))
-                for begin, (kind, advice) in OTHER_LOGS.items():
-                    if start.startswith(begin):
-                        raise SessionError(f"log {path} is {kind}; {ACCEPTED}: {advice}")
-                if start == ROS1_BAG or (path.suffix == ".bag" and start != MCAP0_MAGIC):
-                    raise SessionError(f"log {path} is a ROS 1 bag; {ACCEPTED}: {_CONVERT}")
+                if start.startswith(ZSTD):
+                    raise SessionError(
+                        f"log {path} is compressed by zstd; {ACCEPTED}: unpack it with "
+                        "`zstd -d FILE`"
+                    )
                 if start != MCAP0_MAGIC:
-                    raise SessionError(f"log {path} is not an MCAP file; {ACCEPTED}")
+                    raise SessionError(f"log {path} is of no kind that is read; {ACCEPTED}")
                 self.size = file.seek(0, 2)
                 # Whether messages come in order of log time, else in that of the file.
                 self.is_indexed = self._read_index(file)

@@ -1,0 +1,1 @@
+"""Files of robots' logs: MCAP of any program, and bags of ROS."""
