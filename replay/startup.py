@@ -23,6 +23,7 @@ WRONG_PACKAGE = (
 EXTRAS = {
     "torch": ("torch",),
     "sim": ("pooch", "pybullet", "requests"),
+    "files": ("cascadio", "pypcd4"),
     "sensors": ("PIL", "mcap_ros2", "rosbags", "yourdfpy"),
     "serve": ("aiohttp",),
     "evaluate": ("bokeh", "cryptography", "dask", "distributed", "markdown_it", "matplotlib"),

@@ -28,6 +28,8 @@ LAUNCHED = f"chsel-probe -m {OF_BOX} {SMALL} seed=0,1 recording=mcap hydra/launc
 EXTRAS = {  # what docs/start.md, the pages named there and README.md say that each is for
     "torch": "python torch_cost.py",
     "sim": f"chsel-probe object=spam_can {SMALL}; python -c 'import pooch'",
+    "files": f"chsel-probe session=points session.path=points.pcd object=mesh "
+    f"object.path=cylinder.step {SMALL}",
     "sensors": "chsel-probe session=sensors session.path=frame.yaml session/rig=depth_frame "
     f"object=mesh object.path=box.stl {SMALL}",
     "evaluate": "chsel-evaluate experiment=smoke configurations=can methods=icp steps=5; "
@@ -44,6 +46,20 @@ TORCH_COST = """
 import chsel, torch, trimesh
 sdf = chsel.SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.1, 0.1)), 0.01)
 cost = chsel.RelaxedCost(sdf, chsel.KnownPoints(known=[[0.05, 0.0, 0.0]]))
+"""
+PCD = """VERSION 0.7
+FIELDS x y z
+SIZE 4 4 4
+TYPE F F F
+COUNT 1 1 1
+WIDTH 3
+HEIGHT 1
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS 3
+DATA ascii
+0.0254 0 0
+0 0.0254 0
+0 0 0.0254
 """
 RUN_NOTEBOOK = """
 import json
@@ -166,6 +182,8 @@ def test_an_extra_alone_does_what_it_is_for(version, extra, built, tmp_path):
     depth_frame(folder)
     (folder / "torch_cost.py").write_text(TORCH_COST)
     (folder / "run_notebook.py").write_text(RUN_NOTEBOOK)
+    (folder / "points.pcd").write_text(PCD)
+    shutil.copy(REPOSITORY / "tests/chsel/problem/cylinder_inch.step", folder / "cylinder.step")
     for name in ("from_contacts_to_modes.ipynb", "own_robot.py", "serve_client.py"):
         shutil.copy(REPOSITORY / "examples" / name, folder)
     with socket.create_server(("127.0.0.1", 0)) as free:

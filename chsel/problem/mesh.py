@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import warnings
 from pathlib import Path
@@ -18,18 +19,25 @@ if TYPE_CHECKING:
 
 SMALLEST = 0.005  # metres; objects that a gripper probes have a larger extent
 LARGEST = 10.0  # metres; a larger extent is probably in millimetres
-_ACCEPTED = "accepted: a mesh in metres, such as .stl, .obj, .ply, .glb, .dae, .3mf or .off"
+TESSELLATION = 0.0001  # metres, see load_mesh
+_SOLIDS = ("step", "stp")  # kinds of files in which surfaces are curved
+_MILLIMETRES = 1000.0  # in a metre
+_ACCEPTED = "accepted: a mesh in metres, such as .stl, .obj, .ply, .glb, .dae, .3mf, .step or .off"
 _FAR = 3.0  # diameters from a mesh to the origin of its frame, up to which searches find poses
 _NEAR = 0.5  # largest gap between the bodies of one object, in diameters of the largest body
 _MOST_BODIES = 1000  # that are compared, the largest ones
 
 
-def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
+def load_mesh(
+    path: str | Path, *, scale: float = 1.0, tessellation: float = TESSELLATION
+) -> trimesh.Trimesh:
     """Return the checked mesh in a file of any format that trimesh reads; scenes become one mesh.
 
     scale: metres per unit of the file; where the file states its unit (COLLADA, 3MF), of that unit
-    in metres, with a warning if it is another one. Checks and raises as `clean_mesh`, and MeshError
-    if the file does not exist or cannot be read.
+    in metres, with a warning if it is another one. Solids of STEP files, which state it too, are in
+    metres times scale; tessellation: how far triangles may be from their surface, metres before
+    scale. Checks and raises as `clean_mesh`, and MeshError if the file does not exist or cannot be
+    read.
     """
     import trimesh
 
@@ -39,18 +47,26 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
         what = "is a folder" if path.is_dir() else "does not exist"
         raise MeshError(f"mesh file {path} {what}; {_ACCEPTED}")
     kind = path.suffix.lower().removeprefix(".")
+    options: dict[str, Any] = {}
+    if kind in _SOLIDS:
+        require_positive("mesh tessellation", tessellation)
+        if importlib.util.find_spec("cascadio") is None:
+            raise MeshError(
+                f"mesh file {path} is read by cascadio, which is not installed; {_ACCEPTED}, or "
+                "this one after pip install 'chsel-replay[files]'"
+            )
+        options = {"tol_linear": _MILLIMETRES * tessellation}
     if kind not in trimesh.available_formats():
-        advice = "; pip install cascadio reads it" if kind in ("step", "stp") else ""
-        raise MeshError(f"mesh file {path} is of no kind that can be read{advice}; {_ACCEPTED}")
+        raise MeshError(f"mesh file {path} is of no kind that can be read; {_ACCEPTED}")
     if kind == "obj":
         _refuse_relative_indices(path)
     try:
         loaded = trimesh.load(
-            str(path), file_type=kind, force="mesh", process=False, skip_materials=True
+            str(path), file_type=kind, force="mesh", process=False, skip_materials=True, **options
         )
     except Exception as error:  # readers raise all kinds of errors on damaged files
         # An ImportError comes from guessing the encoding of a text that is not one.
-        damaged = isinstance(error, ImportError)
+        damaged = isinstance(error, ImportError) or (kind in _SOLIDS and path.is_file())
         reason = "it is damaged" if damaged else " ".join(str(error).split())
         if "unexpected length" in reason:
             reason = "it is cut short, or not all faces are triangles: export it with triangles"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Protocol
 import numpy as np
 
 from chsel.errors import MeshWarning, SettingError, require_choice
-from chsel.problem.mesh import load_mesh
+from chsel.problem.mesh import TESSELLATION, load_mesh
 from chsel.problem.points import Workspace
 from chsel.problem.sdf_grid import SdfGrid, object_grid
 from chsel.problem.settings import CheckedSettings, one_of, positive
@@ -31,6 +31,7 @@ class ObjectConfig(CheckedSettings):
     """"model" ships with the project, "scan" is of the YCB set."""
     path: str | None = None  # the mesh, for "file"
     scan: str | None = None  # official folder name, for "scan"
+    tessellation: Annotated[float, positive] = TESSELLATION  # of STEP files, see load_mesh, metres
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -126,7 +127,8 @@ def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:
     Raise SettingError for an unknown model, MeshError if the mesh is missing or unusable.
     """
     if config.kind == "file":
-        mesh = load_mesh(config.path or "", scale=config.scale)
+        path = config.path or ""
+        mesh = load_mesh(path, scale=config.scale, tessellation=config.tessellation)
     elif config.kind == "scan":
         mesh = load_mesh(scan_file(assets, config.scan or ""), scale=config.scale)
     else:

@@ -59,7 +59,7 @@ class PointsSettings:
     their size there, see `ObjectModel.resolution`.
     """
 
-    path: str | None = None  # .npz, .csv, .ply, .off, .xyz or .stl
+    path: str | None = None  # .npz, .csv, .ply, .pcd, .off, .xyz or .stl
     workspace: tuple[tuple[float, float], ...] | None = None
     """[[x0, x1], [y0, y1], [z0, z1]], metres; None: around the points, padded by the diameter."""
     free_resolution: float = FREE_RESOLUTION  # voxel side of free space, metres
@@ -169,6 +169,9 @@ _WITH_NORMALS = ("surface", "known")
 _OF_NORMALS = ("normal", "normal_noise")  # behind these in names of arrays
 _COLUMNS = ["x", "y", "z", "kind", "sdf", "step"]
 _NORMAL = ["nx", "ny", "nz"]
+_PLACE = ("x", "y", "z")
+_PCD_NORMAL = ("normal_x", "normal_y", "normal_z")
+_ORIGIN = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # place and quaternion w, x, y, z of a PCD's sensor
 _ACCEPTED = (
     "x, y, z[, kind[, sdf]][, step][, nx, ny, nz[, normal_noise]], commas between them, decimal "
     "points in numbers"
@@ -206,7 +209,7 @@ class PointFile:
 
 
 def read_points(path: str | Path, *, normal_noise: float | None = None) -> PointFile:
-    """Read .npz, .csv, or the vertices of .ply, .off, .xyz and .stl as surface points.
+    """Read .npz, .csv, or the points of .ply, .pcd, .off, .xyz and .stl as surface points.
 
     normal_noise: of normals about which the file does not say it, radians; None: read no normals.
     Raise PointsError, which names the file and the array or row, for anything malformed.
@@ -431,6 +434,13 @@ def _read_surface(path: Path, normal_noise: float | None) -> PointFile:
             vertices = np.asarray(geometries[0].vertices, dtype=np.float64).reshape(-1, 3)
     except Exception as error:  # readers of foreign formats raise anything
         raise PointsError(_unreadable(f".{kind}", error)) from None
+    return _surface(vertices, directions, normal_noise=normal_noise)
+
+
+def _surface(
+    vertices: FloatArray, directions: FloatArray | None, *, normal_noise: float | None
+) -> PointFile:
+    """Return surface points (N, 3) and their normals (N, 3), each place once if these are read."""
     points = frozen("surface", vertices, shape=(None, 3))
     unread = normal_noise is None and directions is not None
     normals, noise = unit_normals("normals", None, noise=None, count=len(points))
@@ -448,6 +458,33 @@ def _read_surface(path: Path, normal_noise: float | None) -> PointFile:
         normal_noise=noise,
         has_unread_normals=unread,
     )
+
+
+def _read_pcd(path: Path, normal_noise: float | None) -> PointFile:
+    """Return the points of a PCD file as surface points, but those that are not finite."""
+    from pypcd4 import PointCloud  # of the extra "files"
+
+    try:
+        cloud = PointCloud.from_path(path)
+        found = {name: cloud.numpy((name,))[:, 0].astype(np.float64) for name in cloud.fields}
+        viewpoint = tuple(cloud.metadata.viewpoint)
+    except Exception as error:  # readers of foreign formats raise anything
+        raise PointsError(_unreadable(".pcd", error)) from None
+    if not set(_PLACE) <= set(found):
+        raise PointsError(f"its fields are {', '.join(found)}; accepted: x, y and z among them")
+    if viewpoint != _ORIGIN:
+        shown = " ".join(f"{number:g}" for number in viewpoint)
+        raise PointsError(
+            f"its VIEWPOINT is {shown}, and whether its points are in the frame of that sensor is "
+            "not said; accepted: points in the world, with VIEWPOINT 0 0 0 1 0 0 0"
+        )
+    points = np.stack([found[name] for name in _PLACE], axis=1)
+    measured = np.isfinite(points).all(axis=1)  # others are pixels without a measurement
+    directions = None
+    if set(_PCD_NORMAL) <= set(found):
+        directions = np.stack([found[name][measured] for name in _PCD_NORMAL], axis=1)
+        directions[~np.isfinite(directions).all(axis=1)] = 0.0
+    return _surface(points[measured], directions, normal_noise=normal_noise)
 
 
 def _ply_normals(geometry: Any) -> FloatArray | None:
@@ -474,5 +511,6 @@ def _vertices(geometry: Any) -> FloatArray:
 _READERS: dict[str, Callable[[Path, float | None], PointFile]] = {
     ".npz": _read_npz,
     ".csv": _read_csv,
+    ".pcd": _read_pcd,
     **dict.fromkeys((".ply", ".off", ".xyz", ".stl"), _read_surface),
 }

@@ -1,7 +1,9 @@
 """Meshes of files in all formats: units, parts, orientation, and warnings about them."""
 
+import importlib.util
 import warnings
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -218,6 +220,40 @@ def test_the_unit_that_a_file_states_counts_and_scale_multiplies_it(
         assert all(f"states its unit, {metres:.6g} m" in text for text in units)
 
 
+# By Open CASCADE 8.0, with inches as its unit: a cylinder of radius 1 and height 2.
+CYLINDER = Path(__file__).parent / "cylinder_inch.step"
+
+
+@pytest.mark.parametrize("tessellation", [1e-5, 1e-4, 2e-3])
+def test_a_solid_in_inches_is_in_metres_and_within_the_tessellation(tessellation):
+    """The sides of a prism with corners on a circle are inside of it by the sagitta at most."""
+    mesh = load_mesh(CYLINDER, tessellation=tessellation)
+    assert mesh.is_watertight
+    assert mesh.extents[2] == pytest.approx(0.0508)
+    assert mesh.extents[:2].max() == pytest.approx(0.0508, abs=2.0 * tessellation)
+    corners = mesh.vertices[:, :2]
+    np.testing.assert_allclose((corners**2).sum(axis=1) ** 0.5, 0.0254, rtol=1e-5)
+    inside = mesh.volume / (np.pi * 0.0254**2 * 0.0508)
+    assert (1.0 - tessellation / 0.0254) ** 2 < inside < 1.0
+    assert load_mesh(CYLINDER, scale=3.0).extents[2] == pytest.approx(3.0 * 0.0508)
+
+
+def test_a_solid_that_cannot_be_read_is_one_line(tmp_path, monkeypatch):
+    path = tmp_path / "cut.step"
+    path.write_bytes(CYLINDER.read_bytes()[:2000])
+    with pytest.raises(MeshError, match=r"cut\.step cannot be read as \.step: it is damaged; acc"):
+        load_mesh(path)
+    with pytest.raises(
+        SettingError, match=r"mesh tessellation is 0\.0; accepted: a finite number above 0"
+    ):
+        load_mesh(CYLINDER, tessellation=0.0)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(
+        MeshError, match=r"cascadio, which is not installed; .*chsel-replay\[files\]"
+    ):
+        load_mesh(CYLINDER)
+
+
 def test_an_error_about_the_size_names_the_unit_of_the_file(tmp_path):
     collada(
         tmp_path / "a.dae",
@@ -258,7 +294,11 @@ MIXED_PLY = (
 @pytest.mark.parametrize(
     ("file_name", "content", "message"),
     [
-        ("a.step", b"ISO-10303-21;", r"of no kind .* cascadio .*such as \.stl, \.obj"),
+        (
+            "a.step",
+            b"ISO-10303-21;",
+            r"cannot be read as \.step: it is damaged; .*such as \.stl, \.obj",
+        ),
         ("a.slt", b"solid", r"of no kind that can be read; accepted: a mesh in metres"),
         ("a.stl", LFS_POINTER, r"a pointer of Git LFS, not its data; run `git lfs pull`"),
         ("a.ply", MIXED_PLY, r"not all faces are triangles: export it with triangles"),

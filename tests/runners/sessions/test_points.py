@@ -1,6 +1,7 @@
 """Sessions of points in files: formats, steps, repeated places and refusals."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -206,6 +207,56 @@ def test_normals_of_ply_vertices_are_read_where_they_are_asked_for(tmp_path, fac
     binary.export(tmp_path / "binary.ply", vertex_normal=True)
     found = read_points(tmp_path / "binary.ply", normal_noise=0.3).at(0)
     np.testing.assert_allclose(found.normals, np.tile([0.0, 0.6, 0.8], (3, 1)), atol=1e-7)
+
+
+PCD = """# .PCD v0.7
+VERSION 0.7
+FIELDS x y z intensity normal_x normal_y normal_z
+SIZE 4 4 4 2 4 4 4
+TYPE F F F U F F F
+COUNT 1 1 1 1 1 1 1
+WIDTH 4
+HEIGHT 1
+VIEWPOINT {}
+POINTS 4
+DATA ascii
+0 0 0 7 0 0 1
+0.5 0 0 7 nan nan nan
+nan nan nan 7 0 0 1
+0 0.25 0 7 0.6 0 0.8
+"""
+
+
+def test_points_of_pcd_files_are_read_but_those_without_a_measurement(tmp_path):
+    path = text(tmp_path, PCD.format("0 0 0 1 0 0 0"), name="points.pcd")
+    found = read_points(path, normal_noise=0.2)
+    np.testing.assert_array_equal(found.points, [[0, 0, 0], [0.5, 0, 0], [0, 0.25, 0]])
+    np.testing.assert_allclose(found.normals, [[0, 0, 1], [0, 0, 0], [0.6, 0, 0.8]], atol=1e-7)
+    np.testing.assert_array_equal(found.normal_noise, [0.2, 0.0, 0.2])
+    assert read_points(path).has_unread_normals
+    seen = text(tmp_path, PCD.format("0.1 0 0.5 1 0 0 0"), name="seen.pcd")
+    with pytest.raises(PointsError, match=r"its VIEWPOINT is 0\.1 0 0\.5 1 0 0 0, and whether"):
+        read_points(seen)
+
+
+def test_a_compressed_pcd_file_of_open3d_is_read():
+    """Written by Open3D 0.20.0."""
+    found = read_points(Path(__file__).parent / "open3d_compressed.pcd", normal_noise=0.2)
+    points = [[0, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0.1, 0.25, 0.0625]]
+    np.testing.assert_array_equal(found.points, np.float32(points))
+    np.testing.assert_allclose(found.normals[3], [0.6, 0.0, 0.8], atol=1e-7)
+
+
+def test_a_pcd_file_that_is_cut_or_has_no_places_is_one_line(tmp_path):
+    data = (Path(__file__).parent / "open3d_compressed.pcd").read_bytes()
+    (tmp_path / "cut.pcd").write_bytes(data[:-8])
+    with pytest.raises(PointsError, match=r"cut\.pcd: not a readable \.pcd file"):
+        read_points(tmp_path / "cut.pcd")
+    path = text(tmp_path, PCD.format("0 0 0 1 0 0 0").replace(" x y", " u v"), name="uv.pcd")
+    with pytest.raises(
+        PointsError, match=r"its fields are u, v, z, intensity, .*accepted: x, y and"
+    ):
+        read_points(path)
 
 
 @pytest.mark.parametrize("suffix", ["npz", "csv", "ply", "off", "stl", "xyz"])
