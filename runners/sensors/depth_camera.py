@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chsel.errors import SessionError
+from chsel.errors import SessionError, SettingError
 from chsel.events import SensorImage
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.poses import apply
@@ -19,6 +19,7 @@ from chsel.sensing.depth_camera import (
     valid_pixels,
 )
 from chsel.sensing.free_space import FreeGrid
+from chsel.sensing.lens import LensDistortion
 from runners.sensors.cell import RobotCell, is_entered
 from runners.sensors.first_pass import FirstPass, SensorTopic
 from runners.sensors.log.messages import CameraInfoMessage, ImageMessage
@@ -59,8 +60,12 @@ def view_of(
     camera: PinholeCamera,
     cell: RobotCell,
     counts: Counts,
+    lens: LensDistortion | None = None,
 ) -> View | None:
-    """Return an image at a time, nanoseconds, with its pose; None, counted, if it is unusable."""
+    """Return an image at a time, nanoseconds, with its pose; None, counted, if it is unusable.
+
+    lens: of depth images that it distorts, which is undone.
+    """
     shape = (camera.height, camera.width)
     if message.values.shape != shape:
         cell.warnings.warn(
@@ -73,6 +78,7 @@ def view_of(
         counts.lost += 1
         return None
     depth = metres(message.values, rig.unit)
+    depth = depth if lens is None else lens.undistorted(depth, camera)
     valid = valid_pixels(depth, nearest=rig.range[0], furthest=rig.range[1])
     counts.pixels += valid.size
     counts.invalid += int(valid.size - valid.sum())
@@ -155,8 +161,11 @@ def first_images(rig: ImageRig, first_pass: FirstPass) -> list[tuple[int, np.nda
     return images
 
 
-def camera_of(rig: ImageRig, first_pass: FirstPass) -> PinholeCamera:
-    """Return the intrinsics of a sensor. Raise SessionError unless they fit its images."""
+def camera_of(rig: ImageRig, first_pass: FirstPass) -> tuple[PinholeCamera, LensDistortion | None]:
+    """Return the intrinsics of a sensor, and the lens where its images are distorted by it.
+
+    Raise SessionError unless they fit its images, or for a lens of another model.
+    """
     of_info = image_topics(rig)[1]
     infos = first_pass.first(of_info)
     if not infos:
@@ -173,10 +182,13 @@ def camera_of(rig: ImageRig, first_pass: FirstPass) -> PinholeCamera:
             f"images of {rig.name} have {width} x {height} pixels, and its camera info says "
             f"{info.camera.width} x {info.camera.height}; accepted: the same"
         )
-    if info.distorted and not rectified:
-        first_pass.warnings.warn(
-            f"{rig.name}: its camera info names a distortion, which is not undone"
-        )
+    lens = None
+    if info.distortion and not rectified:
+        try:
+            lens = LensDistortion(info.distortion_model, info.distortion)
+        except SettingError as error:
+            text = f"camera info of {rig.name}: {error}, or rectified: true in the rig"
+            raise first_pass.error(text, of_info) from None
     if rig.rectified is None and not rectified and _differ(info):
         first_pass.warnings.warn(
             f"{rig.name}: K and P of its camera info differ, and topic {rig.depth} does not say "
@@ -184,7 +196,7 @@ def camera_of(rig: ImageRig, first_pass: FirstPass) -> PinholeCamera:
         )
     for warning in camera.check_centre():
         first_pass.warnings.warn(f"{rig.name}: {warning.text}")
-    return camera
+    return camera, lens
 
 
 def _differ(info: CameraInfoMessage) -> bool:
@@ -216,6 +228,7 @@ class DepthCamera:
     """A sensor that marks as free what it sees through (CHSEL, Sec. V-B: 95 % of the depth)."""
 
     _camera: PinholeCamera
+    _lens: LensDistortion | None
     _cell: RobotCell
 
     def __init__(self, rig: CameraRig) -> None:
@@ -231,7 +244,7 @@ class DepthCamera:
     def prepare(self, first_pass: FirstPass, cell: RobotCell) -> None:
         """Take the intrinsics. Raise SessionError unless they and depths fit the rig."""
         self._cell = cell
-        self._camera = camera_of(self._rig, first_pass)
+        self._camera, self._lens = camera_of(self._rig, first_pass)
         check_unit(self._rig, first_pass)
         if self._rig.views > 1:
             self._views = FreeGrid(cell.free.workspace, cell.spacing, views=self._rig.views)
@@ -243,7 +256,13 @@ class DepthCamera:
             counts.spared += 1
             return
         view = view_of(
-            message, time, rig=self._rig, camera=self._camera, cell=self._cell, counts=counts
+            message,
+            time,
+            rig=self._rig,
+            camera=self._camera,
+            cell=self._cell,
+            counts=counts,
+            lens=self._lens,
         )
         if view is None:
             return

@@ -22,6 +22,7 @@ from chsel.sensing.depth_camera import (
     valid_pixels,
 )
 from chsel.sensing.free_space import FreeGrid
+from chsel.sensing.lens import LensDistortion
 from runners.sensors.depth_camera import View, edge_pixels, mark_rays, metres
 from runners.sensors.log.images import read_image
 from runners.sensors.pose_file import pose_of_rows, read_yaml
@@ -52,6 +53,8 @@ class FrameFile(CheckedSettings):
     depth_scale: Annotated[float | None, positive] = None
     """Metres a unit; null: 0.001 for integers, 1 for floating point."""
 
+    distortion: tuple[float, ...] = ()  # coefficients of the lens, in the order of OpenCV
+    distortion_model: str = "plumb_bob"  # see `chsel.sensing.lens.LensDistortion`
     label: str | None = None  # image of classes
     object_class: Annotated[int | None, not_negative] = None  # the object's; null: all but 0
     object: str | None = None  # mesh of the object
@@ -96,14 +99,20 @@ def read_depth_frame(path: str | Path) -> DepthFrame:
 def _frame(file: FrameFile, folder: Path) -> DepthFrame:
     depth = _depth(file, folder)
     height, width = depth.shape
+    pinhole = PinholeCamera(width=width, height=height, **asdict(file.intrinsics))
+    label = None if file.label is None else _label(file, folder, shape=depth.shape)
+    if any(file.distortion):
+        lens = LensDistortion(file.distortion_model, file.distortion)
+        depth = lens.undistorted(depth, pinhole)
+        label = None if label is None else lens.undistorted_mask(label, pinhole)
     camera, truth = file.world_from_camera, file.world_from_object
     return DepthFrame(
-        PinholeCamera(width=width, height=height, **asdict(file.intrinsics)),
+        pinhole,
         depth,
         world_from_camera=np.eye(4)
         if camera is None
         else pose_of_rows("world_from_camera", camera),
-        label=None if file.label is None else _label(file, folder, shape=depth.shape),
+        label=label,
         world_from_object=None if truth is None else pose_of_rows("world_from_object", truth),
         mesh=None if file.object is None else folder / Path(file.object).expanduser(),
     )

@@ -119,7 +119,13 @@ class Pad:
     def prepare(self, first_pass: FirstPass, cell: RobotCell) -> None:
         """Take the intrinsics and the untouched membrane. Raise SessionError without them."""
         self._cell = cell
-        self._camera = camera_of(self._rig, first_pass)
+        self._camera, lens = camera_of(self._rig, first_pass)
+        if lens is not None:
+            raise first_pass.error(
+                f"camera info of {self.name} names a distortion, which is undone in images of "
+                "cameras alone; accepted: rectified images, with rectified: true in the rig",
+                self.topics[1],
+            )
         if self._rig.kind == "depth":
             check_unit(self._rig, first_pass)
         self._lengths = np.sqrt((self._camera.directions() ** 2).sum(axis=-1))

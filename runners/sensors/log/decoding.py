@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from typing import Any
@@ -158,7 +159,7 @@ def _compressed_image(message: Any, frame: str) -> ImageMessage:
 
 def _ros2_camera(message: Any, _: str) -> CameraInfoMessage:
     """Return intrinsics of the pixels that are sent: a region of the sensor, binned."""
-    info = _camera(message.width, message.height, k=message.k, p=message.p, d=message.d)
+    info = _camera(message, k=message.k, p=message.p, d=message.d)
     region = message.roi
     across = max(message.binning_x, 1)
     down = max(message.binning_y, 1)
@@ -174,24 +175,31 @@ def _ros2_camera(message: Any, _: str) -> CameraInfoMessage:
         )
 
     rectified = None if info.rectified is None else sent(info.rectified)
-    return CameraInfoMessage(sent(info.camera), info.distorted, rectified=rectified)
+    return replace(info, camera=sent(info.camera), rectified=rectified)
 
 
 def _foxglove_camera(message: Any, _: str) -> CameraInfoMessage:
-    return _camera(message.width, message.height, k=message.K, p=message.P, d=message.D)
+    return _camera(message, k=message.K, p=message.P, d=message.D)
 
 
-def _camera(width: int, height: int, *, k: Any, p: Any, d: Any) -> CameraInfoMessage:
+def _camera(message: Any, *, k: Any, p: Any, d: Any) -> CameraInfoMessage:
     """Return intrinsics of all pixels of a sensor.
 
     k: matrix (9) of images as they are. p: matrix (12, or none) of rectified ones. d: distortion.
     """
+    width, height = message.width, message.height
     rectified = None
     if len(p) == 12 and p[0] != 0.0:
         with suppress(UnusableMessage):  # who rectifies no images may leave anything there
             rectified = _pinhole("P", [*p[:3], *p[4:7], *p[8:11]], width=width, height=height)
+    camera = _pinhole("K", k, width=width, height=height)
+    if not any(d):
+        return CameraInfoMessage(camera, rectified=rectified)
     return CameraInfoMessage(
-        _pinhole("K", k, width=width, height=height), any(d), rectified=rectified
+        camera,
+        tuple(float(number) for number in d),
+        distortion_model=one_line(message.distortion_model),
+        rectified=rectified,
     )
 
 

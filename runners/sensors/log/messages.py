@@ -39,8 +39,11 @@ class CameraInfoMessage:
     camera: PinholeCamera
     """Intrinsics K, of its images as they were taken."""
 
-    distorted: bool = False
-    """Whether lens distortion was left in its images as they were taken."""
+    distortion: tuple[float, ...] = ()
+    """Coefficients of the lens, of its images as they were taken; none where all are 0."""
+
+    distortion_model: str = ""
+    """What they mean, see `chsel.sensing.lens.LensDistortion`."""
 
     rectified: PinholeCamera | None = None
     """Intrinsics P, of rectified images."""

@@ -70,6 +70,22 @@ def written(folder, **changes):
     return path
 
 
+def test_the_lens_of_a_frame_is_undone_in_depth_and_label(tmp_path):
+    """A barrel: what is off the axis was shown nearer to it, and comes back outside."""
+    frame = read_depth_frame(written(tmp_path, distortion=[-1.2, 0.05, 0.0, 0.0, 0.0]))
+    plain = read_depth_frame(written(tmp_path))
+    rows, columns = np.nonzero(frame.label)
+    x = (columns.max() - INTRINSICS["cx"]) / INTRINSICS["fx"]
+    y = (rows.min() - INTRINSICS["cy"]) / INTRINSICS["fy"]
+    squared = x * x + y * y
+    shown = INTRINSICS["cx"] + INTRINSICS["fx"] * x * (1 - 1.2 * squared + 0.05 * squared**2)
+    assert shown == pytest.approx(np.nonzero(plain.label)[1].max(), abs=1.0)
+    assert columns.max() > np.nonzero(plain.label)[1].max()
+    assert frame.depth[frame.label].max() < FRONT + 1e-9
+    with pytest.raises(SessionError, match=r"frame\.yaml: distortion plumb_bob has coefficients"):
+        read_depth_frame(written(tmp_path, distortion=[0.1]))
+
+
 def test_a_frame_is_read_with_all_its_parts(tmp_path):
     rounded = [[round(value, 6) for value in row] for row in POSE]
     path = written(

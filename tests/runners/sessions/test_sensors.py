@@ -312,7 +312,7 @@ K = [1.5 * OUTER.fx, 0.0, OUTER.cx, 0.0, 1.5 * OUTER.fy, OUTER.cy, 0.0, 0.0, 1.0
 
 def test_rectified_images_are_of_the_projection_matrix(tmp_path, log, events):
     """What the camera sees has the intrinsics P; K are those of images that are distorted."""
-    wrong = SphereLog(info=(("k", K), ("d", [0.1]))).write(tmp_path / "log.mcap")
+    wrong = SphereLog(info=(("k", K), ("d", [0.01, 0.0, 0.0, 0.0]))).write(tmp_path / "log.mcap")
     raw = list(open_log(wrong).probes())
     assert "camera: K and P of its camera info differ, and topic /camera/depth does not" in lines(
         raw
@@ -328,6 +328,15 @@ def test_rectified_images_are_of_the_projection_matrix(tmp_path, log, events):
     )
     for one, other in zip(probes(plain), probes(events), strict=True):
         assert one.new_points.digest == other.new_points.digest
+
+
+def test_a_lens_of_an_unknown_model_is_refused_where_images_are_not_rectified(tmp_path):
+    info = (("d", [0.1, 0.0, 0.0]), ("distortion_model", "own"))
+    path = SphereLog(info=info).write(tmp_path / "log.mcap")
+    with pytest.raises(SessionError, match="camera info of camera: distortion model is 'own'; acc"):
+        open_log(path)
+    rectified = replace(RIG, cameras=(replace(RIG.cameras[0], rectified=True),))
+    assert list(open_log(path, rectified).probes())
 
 
 @pytest.mark.parametrize(

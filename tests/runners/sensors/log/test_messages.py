@@ -173,7 +173,9 @@ def test_intrinsics_are_those_of_the_pixels_that_are_sent(tmp_path):
     camera = PinholeCamera(160, 60, fx=200.0, fy=102.5, cx=110.0, cy=50.0)
     content = by_topic(tmp_path / "log.mcap")["/info"].content
     rectified = PinholeCamera(160, 60, fx=400.0, fy=205.0, cx=100.0, cy=40.0)
-    assert content == CameraInfoMessage(camera, distorted=True, rectified=rectified)
+    assert content == CameraInfoMessage(
+        camera, distortion=(0.0, 0.1), distortion_model="plumb_bob", rectified=rectified
+    )
 
 
 @pytest.mark.parametrize(
