@@ -38,6 +38,9 @@ from .sensing.depth_camera import PinholeCamera as PinholeCamera
 from .sensing.free_space import FreeGrid as FreeGrid
 from .sensing.free_space import interior_lattice as interior_lattice
 from .sensing.free_space import poses_between as poses_between
+from .sensing.lens import LensDistortion as LensDistortion
+from .sensing.touch_image import TouchPoints as TouchPoints
+from .sensing.touch_image import touch_points as touch_points
 from .session.judging import trust_by as trust_by
 from .session.loop import Loop as Loop
 from .session.session import NextProbe as NextProbe
