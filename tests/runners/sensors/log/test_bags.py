@@ -2,6 +2,7 @@
 
 import shutil
 import sqlite3
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -128,6 +129,23 @@ def test_camera_infos_and_transforms_of_ros1_have_their_names(tmp_path):
     assert isinstance(content, TransformMessage)
     assert (content.parent, content.child) == ("cam", "hand")
     np.testing.assert_array_equal(content.parent_from_child[:3, 3], [1.0, 2.0, 3.0])
+
+
+def test_a_bag_of_ros1s_own_recorder_is_read():
+    """By rosbag 1.15.15 of Debian, compressed by bz2: five steps of an image, its info and others."""
+    log = RawLog(Path(__file__).parent / "rosbag_1_15.bag")
+    received = list(log.messages(log.topics))
+    assert not log.faults
+    assert len(received) == 25
+    assert (log.begin, log.end) == (1_700_000_000_123456789, 1_700_000_004_123456789)
+    images = [one for one in received if one.topic == "/depth"]
+    for step, one in enumerate(images):
+        values = np.arange(500 + step, 512 + step).reshape(3, 4)
+        np.testing.assert_array_equal(one.content.values, values)
+        assert one.stamp == one.log_time == (1_700_000_000 + step) * SECOND + 123456789
+    assert [one.content for one in received if one.topic == "/probe"][-1] == "begin 4"
+    (wrench, *_) = [one.content for one in received if one.topic == "/wrench"]
+    np.testing.assert_array_equal(wrench.force, [0.0, 0.0, -3.5])
 
 
 def test_bags_that_were_not_finished_are_refused(tmp_path):
