@@ -132,7 +132,7 @@ def test_camera_infos_and_transforms_of_ros1_have_their_names(tmp_path):
 
 
 def test_a_bag_of_ros1s_own_recorder_is_read():
-    """By rosbag 1.15.15 of Debian, compressed by bz2: five steps of an image, its info and others."""
+    """By rosbag 1.15.15 of Debian, compressed by bz2: five steps of an image and more."""
     log = RawLog(Path(__file__).parent / "rosbag_1_15.bag")
     received = list(log.messages(log.topics))
     assert not log.faults
