@@ -36,6 +36,7 @@ from replay.mcap.schemas import NUMBERS
 from replay.verbs.info import step_rows
 
 FORMATS = ("npz", "csv", "json")
+_MILLIMETRES = 1000.0  # in a metre
 _OF_HYPOTHESES = ("object_from_world", "cost", "duplicate", "cell")
 _OF_ARCHIVES = tuple(field.name for field in fields(ArchiveSnapshot))
 _OF_IMAGES = ("values", "unit", "mask", "intrinsics", "world_from_camera")
@@ -82,6 +83,46 @@ def exported_hypotheses(recording: Recording, steps: str | None) -> Exported:
         }
         tables.append(pd.DataFrame(columns | _entries(found.object_from_world)))
     return Exported(arrays.items(), pd.concat(tables))
+
+
+def exported_bop(recording: Recording, steps: str | None) -> Exported:
+    """Return the hypotheses of a session of a BOP dataset as results of the BOP challenge.
+
+    Table: a row a hypothesis, the best first, duplicates left out: scene_id, im_id, obj_id, score,
+    which is minus the cost, R of object to camera by rows, t in millimetres, and time, -1 as none
+    is recorded. npz: `scene_id`, `im_id`, `obj_id`, `score` (B,), `camera_from_object` (B, 4, 4).
+    """
+    session = recording.start.config.get("session")
+    if not isinstance(session, Mapping) or session.get("kind") != "bop":
+        raise RecordingError(
+            f"recording {recording.path} has no image of a BOP dataset; accepted: one of "
+            "session=bop"
+        )
+    numbers = {
+        "scene_id": session["scene"],
+        "im_id": session["image"],
+        "obj_id": session["object_id"],
+    }
+    results = [step for step in recording.steps if recording.has_result(step)]
+    chosen = _chosen(recording, steps, existing=results, name="result")
+    found = recording.hypotheses(chosen[-1])
+    kept = ~found.duplicate
+    poses = inverse(found.object_from_world[kept])  # the camera is the world
+    score = -found.cost[kept]
+    arrays = {**numbers, "score": score, "camera_from_object": poses}
+    columns = {
+        **{name: np.full(len(poses), number) for name, number in numbers.items()},
+        "score": score,
+        "R": [_spaced(pose[:3, :3]) for pose in poses],
+        "t": [_spaced(_MILLIMETRES * pose[:3, 3]) for pose in poses],
+        "time": np.full(len(poses), -1),
+    }
+    return Exported(arrays.items(), pd.DataFrame(columns))
+
+
+def _spaced(numbers: FloatArray) -> str:
+    """Return numbers, exact, with spaces between."""
+    return " ".join(repr(value) for value in numbers.ravel().tolist())
 
 
 def exported_points(recording: Recording, steps: str | None) -> Exported:
@@ -317,6 +358,7 @@ EXPORTS = {
     "metrics": exported_metrics,
     "images": exported_images,
     "decisions": exported_decisions,
+    "bop": exported_bop,
 }
 """Exports by the name that `--what` takes."""
 

@@ -8,6 +8,7 @@ from typing import Any
 from chsel.errors import require_choice
 from chsel.problem.settings import build_settings
 from runners.objects.loader import ObjectModel
+from runners.sessions.bop import BOP
 from runners.sessions.points import POINTS
 from runners.sessions.probing import PROBING
 from runners.sessions.recorded import RECORDED
@@ -17,6 +18,7 @@ from runners.sessions.source import ObjectOrigin, ProbeSource, SourceKind
 KINDS: Mapping[str, SourceKind] = {
     **PROBING,
     "points": POINTS,
+    "bop": BOP,
     "recorded": RECORDED,
     "sensors": SENSORS,
 }

@@ -25,7 +25,7 @@ from runners.sensors.depth_camera import (
     some_rays,
 )
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
-from runners.sensors.depth_frame import depth_frame_points, read_depth_frame
+from runners.sensors.depth_frame import DepthFrame, depth_frame_points, read_depth_frame
 from runners.sensors.first_pass import FirstPass
 from runners.sensors.hand import HandModel, HandPath
 from runners.sensors.log.clocks import in_time_order
@@ -84,7 +84,8 @@ def open_sensors(  # noqa: PLR0917
     """Open the source of a log, or of a depth image. Raise SessionError if it cannot be used."""
     assert object_model is not None
     if Path(settings.path or "").suffix.lower() in FRAME_SUFFIXES:
-        return DepthFrameSource(settings, object_model)
+        frame = read_depth_frame(settings.path or "")
+        return DepthFrameSource(settings, object_model, frame=frame)
     return SensorsSource(settings, seed, diameter=object_model.diameter)
 
 
@@ -218,7 +219,10 @@ class SensorsSource(ProbeSource):
 class DepthFrameSource(ProbeSource):
     """The known points of a depth image as a single probe; see `ProbeSource`."""
 
-    def __init__(self, settings: SensorsSettings, object_model: ObjectModel) -> None:
+    def __init__(
+        self, settings: SensorsSettings, object_model: ObjectModel, *, frame: DepthFrame
+    ) -> None:
+        """frame: of the file at the path of the settings."""
         self.report: Report = Report()
         self.free_resolution = settings.free_resolution
         self.initial_points = KnownPoints()
@@ -228,7 +232,7 @@ class DepthFrameSource(ProbeSource):
         self._rig = settings.rig
         self._path = Path(settings.path or "").expanduser()
         self._images = settings.images
-        self._frame = read_depth_frame(self._path)
+        self._frame = frame
         self._points = depth_frame_points(
             self._frame,
             self._rig,

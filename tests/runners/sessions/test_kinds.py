@@ -21,6 +21,7 @@ from runners.sensors.session_report import Report
 from runners.sessions import KINDS, kinds_of, open_source, session_settings
 from runners.sessions.source import ObjectOrigin, ProbeEvent, ProbeSource, Steerable
 from tests.chsel.samples import REPOSITORY
+from tests.runners.bop_dataset import write_bop
 from tests.runners.sensors.sphere_log import RIG, SphereLog
 
 RECORDING = REPOSITORY / "tests" / "replays" / "mustard_svgd.mcap"
@@ -46,6 +47,10 @@ def values(kind, folder):
     if kind == "sensors":
         log = SphereLog().write(folder / "log.mcap")
         return {"path": str(log), "rig": settings_mapping(RIG)}
+    if kind == "bop":
+        rig = OmegaConf.load(REPOSITORY / "conf" / "session" / "rig" / "depth_frame.yaml")
+        image = {"scene": 2, "image": 7, "object_id": 9, "dataset": str(write_bop(folder))}
+        return {**image, "rig": OmegaConf.to_container(rig)}
     return {}
 
 
@@ -68,7 +73,7 @@ def test_a_source_of_every_kind_has_all_members_of_the_protocol(kind, tmp_path):
     assert source.start == Start(contacts=3, step=2)
     assert source.push_distance == 0.0
     assert len(source.warnings) == 0
-    assert (source.report is None) == (kind != "sensors")
+    assert (source.report is None) == (kind not in ("bop", "sensors"))
     assert (source.recorded is None) == (origin is not ObjectOrigin.RECORDED)
     if origin is ObjectOrigin.PLACED:
         events = list(islice(source.probes(), 2))
