@@ -16,11 +16,7 @@ help: ## list the targets
 	@sed -n '/^# Options/,/^$$/s/^# //p' Makefile
 
 probe: $(VENV)/.installed ## set up and run a session
-	@if $(BIN)/python -c "import pybullet" 2>/dev/null; then session=simulated; else \
-		session=kinematic; \
-		echo "PyBullet has no wheel for this Python (it has for 3.11): running session=kinematic"; \
-	fi; \
-	$(BIN)/python -m runners.probe object=drill method=chsel session=$$session
+	$(BIN)/python -m runners.probe object=drill method=chsel
 
 check: lint ## linter, types, and tests of what differs from the last commit, in half a minute
 	$(BIN)/python -m tests.tools.changed

@@ -19,6 +19,7 @@ PACKAGES = (
     "libigl",
     "trimesh",
     "pybullet",
+    "mujoco-core",
     "mcap",
 )
 

@@ -22,7 +22,7 @@ WRONG_PACKAGE = (
 
 EXTRAS = {
     "torch": ("torch",),
-    "sim": ("pooch", "pybullet", "requests"),
+    "sim": ("mujoco", "pooch", "pybullet", "requests"),
     "files": ("cascadio", "pypcd4"),
     "sensors": ("PIL", "mcap_ros2", "rosbags", "yourdfpy"),
     "serve": ("aiohttp",),

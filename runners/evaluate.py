@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +37,7 @@ from runners.reporting.sections import short_tables
 from runners.reporting.tables import print_table
 from runners.run.setup import PresetName
 from runners.sessions.faults import CLEAN, LEVELS, LEVELS_OF_POINTS
+from runners.sessions.physics_engine import default_engine, require_engine, with_engine
 from runners.sessions.probing_settings import without_defaults
 
 
@@ -157,7 +157,9 @@ def _plan(config: EvaluateConfig) -> Plan:
     return Plan(
         folder=path(config.out),
         preset=preset,
-        session={key: v for key, v in session.items() if key not in ("configuration", "logs")},
+        session=with_engine(
+            {key: v for key, v in session.items() if key not in ("configuration", "logs")}
+        ),
         objects=config.objects,
         definition=config.definition,
         metrics=config.metrics,
@@ -200,8 +202,8 @@ def _check(plan: Plan, trials: list[Trial], *, levels: tuple[str, ...]) -> None:
         to_simulate = any(is_missing(plan, trial) for trial in trials)
     elif plan.logs is not None:
         raise SettingError(f"session.logs is for session=sensors; this one is {plan.kind}")
-    if to_simulate and importlib.util.find_spec("pybullet") is None:
-        raise SettingError(f"session={plan.kind} needs PyBullet; accepted here: session=kinematic")
+    if to_simulate:
+        require_engine(plan.session.get("engine") or default_engine())
     if not any(plan.steps_of(trial.configuration) for trial in trials):
         raise SettingError(f"steps is {plan.steps}; accepted: steps that a configuration has")
     for trial in trials:

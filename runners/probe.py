@@ -35,6 +35,7 @@ from runners.run.recording import make_run_folder, write_in_run_folder
 from runners.run.session_run import Row, steps
 from runners.run.setup import GRID, ProbeConfig, RunSetup, open_setup, session_started
 from runners.sessions import kinds_of, source_kind
+from runners.sessions.physics_engine import with_engine
 from runners.sessions.source import ObjectOrigin
 
 
@@ -42,12 +43,14 @@ from runners.sessions.source import ObjectOrigin
 def main(config: DictConfig) -> None:
     """Run one session."""
     values = plain(config)
+    values["session"] = with_engine(values["session"])
     checked = build_settings(ProbeConfig, values, where="probe")
     _require_used_settings(checked)
     method_config = dict(checked.method)
     kind = checked.session.get("kind")
     method_name = str(method_config.pop("name", None))
-    title = f"{kind} session, {method_name}, preset {checked.preset.name}, seed {checked.seed}"
+    title = f"{_session_title(checked)}, {method_name}, preset {checked.preset.name}"
+    title += f", seed {checked.seed}"
     if source_kind(kind).object is not ObjectOrigin.RECORDED:  # that is known once it is read
         title = f"{checked.object.name}, {title}"
     display = Display(title)
@@ -84,6 +87,12 @@ def main(config: DictConfig) -> None:
         sys.exit(130)
 
 
+def _session_title(config: ProbeConfig) -> str:
+    """Return what a session is called, a simulated one with its engine."""
+    kind = config.session.get("kind")
+    return f"{kind} session" + (f" in {config.session['engine']}" if kind == "simulated" else "")
+
+
 def _require_used_settings(config: ProbeConfig) -> None:
     """Raise SettingError for a setting that would change nothing, as another choice is made."""
     kind = config.session.get("kind")
@@ -96,6 +105,9 @@ def _require_used_settings(config: ProbeConfig) -> None:
         starts = (f"session.{name}" for name in ("start_contacts", "start_probe"))
         reason = "a session with a policy registers from its first contact on"
         require_used(*starts, reason=reason, accepted="policy=grid with it")
+    if kind == "kinematic":
+        reason, accepted = "a kinematic session has no physics engine", "session=simulated with it"
+        require_used("session.engine", reason=reason, accepted=accepted)
     if origin is ObjectOrigin.RECORDED:
         reason, accepted = "a recorded session brings its own object", "another session with it"
         require_used("object", "configuration", reason=reason, accepted=accepted)

@@ -10,9 +10,11 @@ from hypothesis import settings
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 LONGEST = (  # minutes each; files that start first end before others are done
-    "tests/determinism/test_matrix.py",
-    "tests/runners/test_benchmark.py",
+    "tests/runners/sessions/test_simulated.py",
     "tests/runners/test_evaluate.py",
+    "tests/runners/test_benchmark.py",
+    "tests/runners/test_steering.py",
+    "tests/runners/sessions/test_fitted.py",
 )
 settings.register_profile("random", deadline=None)  # --hypothesis-profile=random: other examples
 settings.register_profile("fixed", deadline=None, derandomize=True)

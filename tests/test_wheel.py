@@ -172,8 +172,6 @@ def test_an_installation_registers_in_any_folder_as_here(version, archive, built
 @pytest.mark.parametrize("extra", EXTRAS)
 @pytest.mark.parametrize("version", VERSIONS)
 def test_an_extra_alone_does_what_it_is_for(version, extra, built, tmp_path):
-    if extra == "sim" and version != "3.11":
-        pytest.skip("PyBullet has wheels for Python 3.11 alone")
     _, options = installed(f"{built['wheel']}[{extra}]", version, folder=tmp_path)
     folder = options["cwd"]
     box = trimesh.creation.box((0.1, 0.06, 0.2))

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.points import Lattice
 from runners.sessions.gripper import START, Touch
 from runners.sessions.mesh_surface import MeshSurface
 from runners.sessions.probing_hand import ProbingHand, turned_from_forward
@@ -18,8 +15,6 @@ from runners.sessions.probing_settings import ProbingSettings
 if TYPE_CHECKING:
     import trimesh
 
-SPACING = 0.001  # m: of the points on the hand that can touch
-PATCH = 0.010  # m: side of the patches of these points that are passed over as one
 PRECISION = 1e-6  # m: of the first contact along a mini-step
 
 
@@ -36,7 +31,7 @@ class KinematicEngine:
     ) -> None:
         """Put a mesh, metres, in its frame, at world_from_object (4, 4), until it is moved."""
         self._mesh = mesh
-        self._patches = self._forward = _patches(hand)
+        self._patches = self._forward = hand.patches()
         self._turn = np.eye(3)  # of the patches, from how a hand probes along x
         self._position = np.array(START)
         self._force = settings.max_force
@@ -107,29 +102,3 @@ class KinematicEngine:
         distance, contacts, normals = self._object.closest(points + self._position)
         first = int(np.argmin(distance))
         return Touch(self._position, self._force, contact=contacts[first], normal=normals[first])
-
-
-@dataclass(frozen=True, eq=False)
-class _Patches:
-    """Points on the hand's surface, by patches."""
-
-    points: FloatArray  # (S, 3), metres
-    labels: np.ndarray  # (S,), indices of their patches
-    centres: FloatArray  # (P, 3), metres
-    radii: FloatArray  # (P,), metres, of all points of a patch around its centre
-
-    def turned(self, turn: FloatArray) -> _Patches:
-        """Return the patches of a hand that is turned by (3, 3) about its origin."""
-        return replace(self, points=self.points @ turn.T, centres=self.centres @ turn.T)
-
-
-@lru_cache(maxsize=2)
-def _patches(hand: ProbingHand) -> _Patches:
-    points = hand.surface_points(SPACING)
-    voxels = Lattice((0.0, 0.0, 0.0), PATCH).voxels(points)
-    _, labels = np.unique(voxels, axis=0, return_inverse=True)
-    count = np.bincount(labels)
-    centres = np.stack([np.bincount(labels, axis) / count for axis in points.T], axis=1)
-    radii = np.zeros(len(centres))
-    np.maximum.at(radii, labels, np.sqrt(((points - centres[labels]) ** 2).sum(axis=1)))
-    return _Patches(points, labels, centres=centres, radii=radii)

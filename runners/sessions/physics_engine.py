@@ -1,30 +1,62 @@
-"""PyBullet, imported where a program needs it and nowhere else."""
+"""The physics engines, PyBullet and MuJoCo, imported where a program needs one and nowhere else."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import Any
 
 from chsel.errors import SessionError
 
+ENGINES = ("pybullet", "mujoco")
+"""Names of the physics engines, which are those of their modules."""
 _OUTPUTS = (1, 2)
+_INSTALL = "pip install -e '.[sim]' where the project is"
+_WITHOUT = "session=kinematic, the same session without a physics engine"
 
 
-def connect(instead: str) -> Any:
-    """Return a new world; SessionError, which says what to do `instead`, without PyBullet."""
+def default_engine() -> str:
+    """Return the engine of a session that names none: PyBullet where it is installed."""
+    return "mujoco" if find_spec("pybullet") is None else "pybullet"
+
+
+def with_engine(session: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings of a session, a simulated one with the name of its engine."""
+    if session.get("kind") != "simulated" or session.get("engine") is not None:
+        return dict(session)
+    return {**session, "engine": default_engine()}
+
+
+def require_engine(name: str) -> None:
+    """Raise SessionError if an engine is not installed."""
+    if find_spec(name) is not None:
+        return
+    others = [f"session.engine={other}" for other in ENGINES if find_spec(other) is not None]
+    raise SessionError(
+        f"the physics engine {name} is not installed ({_INSTALL}); accepted: "
+        f"{' or '.join([*others, _WITHOUT])}"
+    )
+
+
+def import_mujoco() -> Any:
+    """Return the module mujoco. Raise SessionError where it is not installed."""
+    require_engine("mujoco")
+    import mujoco
+
+    return mujoco
+
+
+def connect() -> Any:
+    """Return a new world of PyBullet. Raise SessionError where it is not installed."""
+    require_engine("pybullet")
     with silent():
-        try:
-            import pybullet
-            from pybullet_utils.bullet_client import BulletClient
-        except ImportError:
-            raise SessionError(
-                "PyBullet is not installed (pip install -e '.[sim]' where the project is; it has "
-                f"wheels for Python 3.11 only); {instead}"
-            ) from None
+        import pybullet
+        from pybullet_utils.bullet_client import BulletClient
+
         return BulletClient(pybullet.DIRECT)
 
 

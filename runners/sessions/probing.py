@@ -35,6 +35,7 @@ from runners.sessions.configurations import (
 from runners.sessions.faults import CLEAN, Faults, FaultSettings, probed_mesh
 from runners.sessions.fitted import fitted_configuration
 from runners.sessions.gripper import X_REST, Engine, SimulatedGripper
+from runners.sessions.physics_engine import default_engine
 from runners.sessions.placement import centre_of_mass, laid_down, on_stand
 from runners.sessions.probing_hand import (
     ROTATION,
@@ -54,13 +55,22 @@ SLAB_LAYERS = 2
 _TURN = 0.7  # standard deviation: the turn of an object pushed, by its way in diameters
 
 
-def _pybullet_engine(  # noqa: PLR0917
+def _physics_engine(  # noqa: PLR0917
     mesh: trimesh.Trimesh,
     configuration: Configuration,
     settings: ProbingSettings,
     hand: ProbingHand,
 ) -> Engine:
-    from runners.sessions.simulated import PyBulletEngine
+    if (settings.engine or default_engine()) == "mujoco":
+        from runners.sessions.mujoco_engine import MuJoCoEngine
+
+        if settings.collision_mesh != "visual":
+            raise SettingError(
+                f"collision_mesh is {settings.collision_mesh}; accepted in mujoco: visual, as it "
+                "touches the faces of the mesh itself"
+            )
+        return MuJoCoEngine(mesh, configuration, settings=settings, hand=hand)
+    from runners.sessions.pybullet_engine import PyBulletEngine
 
     return PyBulletEngine(mesh, configuration, settings=settings, hand=hand)
 
@@ -78,7 +88,7 @@ def _kinematic_engine(  # noqa: PLR0917
 
 
 ENGINES: Mapping[str, Callable[..., Engine]] = {
-    "simulated": _pybullet_engine,
+    "simulated": _physics_engine,
     "kinematic": _kinematic_engine,
 }
 """Openers of the engines by the kinds of their sources, imported when they are used."""
@@ -94,7 +104,7 @@ def open_probing(
 ) -> ProbingSource:
     """Open a source of a kind of ENGINES; mesh in its own frame, metres.
 
-    Raise SettingError for an unknown configuration, SessionError where PyBullet is not installed.
+    Raise SettingError for an unknown configuration, SessionError where the engine is not installed.
     """
     hand = open_hand(settings.hand)
     if configuration_name == FITTED:

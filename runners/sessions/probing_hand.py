@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 # of the hand (hand y) lies along world y.
 ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 LARGEST = 0.5  # m: extent of a hand along any axis
+SPACING = 0.001  # m: of the points on the hand that can touch
+PATCH = 0.010  # m: side of the patches of these points that are passed over as one
 _FLUSH = 1e-9  # m: of two solids that share a face
 
 
@@ -39,6 +41,20 @@ class DescribedHand:
     urdf: str | None = None  # file whose links' collision shapes belong to the hand, joints at 0
     root: str | None = None  # the link of the urdf whose frame is the hand's; None: its base
     boxes: tuple[BoxRig, ...] = ()  # more parts, in the hand's frame
+
+
+@dataclass(frozen=True, eq=False)
+class HandPatches:
+    """Points on a hand's surface, by patches that are passed over as one."""
+
+    points: FloatArray  # (S, 3), metres
+    labels: np.ndarray  # (S,), indices of their patches
+    centres: FloatArray  # (P, 3), metres
+    radii: FloatArray  # (P,), metres, of all points of a patch around its centre
+
+    def turned(self, turn: FloatArray) -> HandPatches:
+        """Return the patches of a hand that is turned by (3, 3) about its origin."""
+        return replace(self, points=self.points @ turn.T, centres=self.centres @ turn.T)
 
 
 class ProbingHand:
@@ -64,6 +80,18 @@ class ProbingHand:
         """Return points (S, 3) that cover the surface about `spacing` apart, with all corners."""
         parts = [self._covering(index, spacing) for index in range(len(self.solids))]
         return np.concatenate(parts)
+
+    @cache  # noqa: B019
+    def patches(self) -> HandPatches:
+        """Return points that cover the surface 1 mm apart, in patches of 1 cm."""
+        points = self.surface_points(SPACING)
+        voxels = Lattice((0.0, 0.0, 0.0), PATCH).voxels(points)
+        _, labels = np.unique(voxels, axis=0, return_inverse=True)
+        count = np.bincount(labels)
+        centres = np.stack([np.bincount(labels, axis) / count for axis in points.T], axis=1)
+        radii = np.zeros(len(centres))
+        np.maximum.at(radii, labels, np.sqrt(((points - centres[labels]) ** 2).sum(axis=1)))
+        return HandPatches(points, labels, centres=centres, radii=radii)
 
     def interior_points(self, spacing: float, depth: float) -> FloatArray:
         """Return nodes (M, 3) of a lattice through the origin, deeper than `depth` in a solid."""

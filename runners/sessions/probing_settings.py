@@ -18,12 +18,14 @@ from chsel.problem.settings import (
     positive,
 )
 from runners.sessions.faults import CLEAN, LEVELS, FaultSettings
+from runners.sessions.physics_engine import ENGINES
 from runners.sessions.probing_hand import DescribedHand
 
 Length = Annotated[float, positive]  # m
 Force = Annotated[float, positive]  # N
 Count = Annotated[int, not_negative]
 _NOT_RECORDED = (
+    ("engine", None),  # of a session without one
     *(("moves", 0.0), ("expect_moves", None)),  # an object that stands still
     *(("normals", "none"), ("normal_noise", NORMAL_NOISE)),  # of points in files
 )
@@ -40,6 +42,8 @@ class ProbingSettings(CheckedSettings):
     """Settings of the gripper, of its probes, and of what is recorded of them."""
 
     configuration: str | None = None  # one of the 17, or FITTED; None: the object's
+    engine: Annotated[str, one_of(*ENGINES)] | None = None
+    """Physics engine of a simulated session; None: PyBullet where it is installed, else MuJoCo."""
     boundary: Annotated[str, one_of("floor_slab", "box_shell", "both")] = "floor_slab"
     """Voxels free from the start: two layers below the floor, the workspace's faces, or both."""
     workspace: Annotated[str, one_of("reference", "paper")] = "reference"

@@ -11,7 +11,7 @@ from chsel.problem.poses import apply, inverse
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.rig import ContactRig
 from runners.simulated_robot.cabinet import CAP, CAP_BASE, PADS, wrist_from_bubble_camera
-from runners.simulated_robot.physics_scene import PhysicsScene
+from runners.simulated_robot.scene import Scene
 from runners.simulated_robot.settings import RenderedCamera
 
 THICKNESS = 0.001  # m: how much nearer than its base it can never be pressed
@@ -89,7 +89,7 @@ class Pads:
 
     def __init__(
         self,
-        scene: PhysicsScene,
+        scene: Scene,
         camera: RenderedCamera,
         *,
         mesh: trimesh.Trimesh,

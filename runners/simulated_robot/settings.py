@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 from math import pi, tan
 from typing import Annotated
 
-from chsel.problem.settings import CheckedSettings, at_most, not_negative, positive
+from chsel.problem.settings import CheckedSettings, at_most, not_negative, one_of, positive
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.sessions.faults import number_between
+from runners.sessions.physics_engine import ENGINES
 from runners.simulated_robot.cabinet import CAP, CAP_BASE
 
 VIEW = 80.0  # degrees: of the outer camera, horizontal
@@ -63,6 +64,7 @@ class RobotSettings(CheckedSettings):
     """Settings of the robot's probes and sensors."""
 
     probes: Annotated[int | None, positive] = None  # of the configuration's grid; null: all
+    engine: Annotated[str, one_of(*ENGINES)] | None = None  # null: PyBullet if there, else MuJoCo
     camera: CameraSettings = field(default_factory=CameraSettings)
     bubbles: BubbleSettings = field(default_factory=BubbleSettings)
     push_steps: Annotated[int, number_between(1, 5)] = 5  # of 5 cm, of a push at most

@@ -30,7 +30,7 @@ from runners.simulated_robot.cabinet import (
 from runners.simulated_robot.log_writer import LogWriter
 from runners.simulated_robot.noise import bubble_depth, stereo_depth
 from runners.simulated_robot.pads import Pads
-from runners.simulated_robot.physics_scene import PhysicsScene
+from runners.simulated_robot.scene import Scene, open_scene
 from runners.simulated_robot.settings import RobotSettings
 
 WORLD = "world"
@@ -88,7 +88,7 @@ def simulate_log(
     """Probe an object in the cabinet, and write the raw log; an older file of that name is gone.
 
     mesh: in its own frame, metres, of real size. The same arguments give the same bytes. Raises
-    SessionError if the object does not fit the cabinet, or where PyBullet is not installed.
+    SessionError if the object does not fit the cabinet, or where the engine is not installed.
     """
     most = len(configuration.grid)
     if settings.probes is not None and settings.probes > most:
@@ -96,7 +96,7 @@ def simulate_log(
     world_from_object = stood_on_shelf(mesh, configuration)
     pushes = []
     with (
-        closing(PhysicsScene(mesh, world_from_object)) as scene,
+        closing(open_scene(mesh, world_from_object, engine=settings.engine)) as scene,
         whole_file(path, "a file in a folder that can be written") as beside,
         LogWriter(beside) as log,
     ):
@@ -115,7 +115,7 @@ class _Robot:
     """Moves the wrist on straight lines, and sends at every tick of its clock what is due."""
 
     def __init__(
-        self, log: LogWriter, scene: PhysicsScene, *, pads: Pads, settings: RobotSettings, seed: int
+        self, log: LogWriter, scene: Scene, *, pads: Pads, settings: RobotSettings, seed: int
     ) -> None:
         self._log = log
         self._scene = scene

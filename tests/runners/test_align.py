@@ -101,7 +101,6 @@ def test_plausible_sets_are_made_around_the_pose_beside_a_recording(path):
 
 
 def test_a_raw_log_is_read_first_and_its_object_is_named(tmp_path):
-    pytest.importorskip("pybullet")
     from runners.simulated_robot.simulation import simulate_log
 
     log = tmp_path / "log.mcap"

@@ -222,6 +222,27 @@ def test_a_recorded_session_repeats_the_probes_with_another_method(finished, tmp
 
 
 @pytest.mark.usefixtures("interruptible")
+def test_a_session_says_its_engine_and_is_replayed_without_any(tmp_path):
+    quick = ("method=icp", "recording=mcap", "session.start_probe=10", "object=spam_can")
+    done = run(tmp_path, *quick, "session.engine=mujoco")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("spam_can, simulated session in mujoco, icp, preset default")
+    folder = run_folder(tmp_path)
+    assert yaml.safe_load((folder / "config.yaml").read_text())["session"]["engine"] == "mujoco"
+    path = folder / "recording.mcap"
+    assert read_recording(path).start.config["session"]["engine"] == "mujoco"
+    missing = "import sys; sys.modules |= dict.fromkeys(('mujoco', 'pybullet'))"
+    verify = f"{missing}; sys.argv[1:] = ['verify', {str(path)!r}]"
+    code = f"{verify}; from replay.__main__ import program; program()"
+    verified = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "2 of 2 steps equal (icp)" in verified.stdout, verified.stderr
+    refused = run(tmp_path, "session=kinematic", "session.engine=mujoco")
+    assert refused.returncode == 2
+    assert "session.engine has no effect: a kinematic session has no physics engine" in (
+        refused.stderr
+    )
+
+
 def test_ctrl_c_ends_with_a_whole_recording_and_status_130(points, tmp_path):
     command = [sys.executable, "-m", "runners.probe", *points, f"logs={tmp_path}"]
     slow = ["method=chsel", "method.emitter.iterations=50000", "recording=mcap"]

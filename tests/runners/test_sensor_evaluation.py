@@ -143,7 +143,6 @@ def test_an_evaluation_of_logs_that_cannot_be_is_one_line(tmp_path, arguments, m
 
 
 def test_a_trial_gets_its_log_its_true_pose_and_its_results(tmp_path, monkeypatch):
-    pytest.importorskip("pybullet")
     from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
 
     small = RobotSettings(

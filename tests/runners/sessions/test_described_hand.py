@@ -12,6 +12,7 @@ from chsel.next_probe.action_lattice import ActionSettings
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
+from runners.sessions.physics_engine import ENGINES
 from runners.sessions.probing import open_probing
 from runners.sessions.probing_hand import DescribedHand, open_hand
 from runners.sessions.probing_settings import ProbingSettings
@@ -52,12 +53,13 @@ def test_a_hand_from_a_urdf_probes_along_its_z_axis(stick):
     assert np.max(depth) < 1e-9
 
 
-@pytest.mark.parametrize("kind", ["kinematic", "simulated"])
-def test_both_engines_touch_with_the_described_hand(kind, stick):
+@pytest.mark.parametrize("engine", [None, *ENGINES])
+def test_all_engines_touch_with_the_described_hand(engine, stick):
     box = trimesh.creation.box((0.2, 0.3, 0.3))
-    settings = replace(ProbingSettings(), hand=stick, noise=0.0)
-    if kind == "simulated":
-        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
+    settings = replace(ProbingSettings(), hand=stick, noise=0.0, engine=engine)
+    kind = "kinematic" if engine is None else "simulated"
+    if engine is not None:
+        pytest.importorskip(engine, reason=f"{engine} is not installed")
     session = open_probing(kind, box, configuration_name="can", settings=settings, seed=0)
     actions = session.offer(ActionSettings(choice="configuration"))
     face = apply(session.world_from_object, np.asarray(box.vertices))[:, 0].min()

@@ -47,8 +47,6 @@ def probed(kind, mesh, *, settings=None):
     [*(("kinematic", name) for name in MESHES), ("simulated", "30 mm"), ("simulated", "plate")],
 )
 def test_most_probes_touch_an_object_all_over(kind, name):
-    if kind == "simulated":
-        pytest.importorskip("pybullet")
     mesh = MESHES[name]
     session, probes = probed(kind, mesh)
     contacts = np.concatenate([probe.contacts for probe in probes])

@@ -1,7 +1,6 @@
 """Every kind of sources in the registry opens a source that has all members of the protocol."""
 
 from dataclasses import fields
-from importlib.util import find_spec
 from itertools import islice
 from typing import get_args
 
@@ -56,8 +55,6 @@ def values(kind, folder):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_source_of_every_kind_has_all_members_of_the_protocol(kind, tmp_path):
-    if kind == "simulated" and find_spec("pybullet") is None:
-        pytest.skip("PyBullet is not installed")
     origin = KINDS[kind].object
     settings = session_settings(kind, values(kind, tmp_path) | STARTED)
     source = open_source(

@@ -64,10 +64,8 @@ def test_a_finger_that_meets_an_edge_reports_one_of_its_two_faces():
 @pytest.mark.parametrize("kind", ["kinematic", "simulated"])
 @pytest.mark.parametrize("name", SHARP_OBJECTS)
 def test_contacts_of_sharp_and_thin_objects_have_the_normal_of_a_face_there(kind, name):
-    if kind == "simulated":
-        pytest.importorskip("pybullet")
     mesh = SHARP_OBJECTS[name]
-    settings = ProbingSettings(faults=FaultSettings(normals=0.2))
+    settings = ProbingSettings(faults=FaultSettings(normals=0.2), engine="mujoco")
     session = open_probing(kind, mesh, configuration_name=FITTED, settings=settings, seed=0)
     points = KnownPoints.joined([probe.new_points for probe in session.probes()])
     session.close()

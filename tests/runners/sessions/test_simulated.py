@@ -1,4 +1,4 @@
-"""The simulated session beside the geometry of the kinematic one."""
+"""The simulated session, in both engines, beside the geometry of the kinematic one."""
 
 import subprocess
 import sys
@@ -8,30 +8,34 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.errors import SessionError
+from chsel.errors import SessionError, SettingError
 from chsel.events import Probe
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from runners.objects.loader import load_model
+from runners.sessions import physics_engine
 from runners.sessions.configurations import CONFIGURATIONS
+from runners.sessions.physics_engine import ENGINES
 from runners.sessions.placement import laid_down, lowest
 from runners.sessions.probing import open_probing
 from runners.sessions.probing_hand import panda_hand
 from runners.sessions.probing_settings import ProbingSettings
 
-pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
-
 SCALES = {"cracker_box": 1.5, "clamp": 5.0}
 AGREEMENT = 0.003  # m
 PRESSED = 0.0005  # m: how far 30 N press the hand into the object before the engine resists
 
+MANY = ("clamp_sideways", "drill", "drill_fallen", "hammer", "hammer_fallen", "mustard_fallen")
+FEW = ("box", "can", "clamp", "mustard")  # of those with PyBullet, which takes longer
+
 DIGESTS = """
+import sys
 from runners.objects.loader import load_model
 from runners.sessions.probing_settings import ProbingSettings
 from runners.sessions.probing import open_probing
 model = load_model("spam_can", 2.5)
-settings = ProbingSettings()
+settings = ProbingSettings(engine=sys.argv[1])
 session = open_probing("simulated", model, configuration_name="can", settings=settings, seed=5)
 print(session.world_from_object.tobytes().hex(), session.initial_points.digest)
 for probe, _ in zip(session.probes(), range(4)):
@@ -54,14 +58,25 @@ def _mesh(configuration_name):
     return load_model(name).apply_scale(SCALES.get(name, 2.5))
 
 
-@pytest.fixture(scope="module", params=list(CONFIGURATIONS))
+def _pairs():
+    """All configurations in both engines; in each some at every commit."""
+    for engine, often in (("mujoco", {*MANY, *FEW}), ("pybullet", FEW)):
+        for name in CONFIGURATIONS:
+            marks = () if name in often else pytest.mark.slow
+            yield pytest.param((engine, name), id=f"{engine}-{name}", marks=marks)
+
+
+@pytest.fixture(scope="module", params=_pairs())
 def pair(request):
-    mesh = _mesh(request.param)
-    simulated = open_probing(
-        "simulated", mesh, configuration_name=request.param, settings=ProbingSettings(), seed=0
-    )
-    kinematic = open_probing(
-        "kinematic", mesh, configuration_name=request.param, settings=ProbingSettings(), seed=0
+    engine, name = request.param
+    pytest.importorskip(engine, reason=f"{engine} is not installed")
+    mesh = _mesh(name)
+    simulated, kinematic = (
+        open_probing(kind, mesh, configuration_name=name, settings=settings, seed=0)
+        for kind, settings in (
+            ("simulated", ProbingSettings(engine=engine)),
+            ("kinematic", ProbingSettings()),
+        )
     )
     both = list(simulated.probes()), list(kinematic.probes())
     simulated.close()
@@ -118,14 +133,16 @@ def test_free_space_is_nearly_that_of_plain_geometry(pair):
 
 def test_the_settled_object_lies_on_the_floor_where_geometry_has_laid_it(pair, request):
     assert lowest(pair.mesh, pair.world_from_object) == pytest.approx(0.0, abs=1e-9)
-    laid = laid_down(pair.mesh, CONFIGURATIONS[request.node.callspec.params["pair"]])
+    laid = laid_down(pair.mesh, CONFIGURATIONS[request.node.callspec.params["pair"][1]])
     vertices = np.asarray(pair.mesh.vertices)
     moved = apply(pair.world_from_object, vertices) - apply(laid, vertices)
     assert np.sqrt((moved**2).sum(axis=1)).max() < 0.001
 
 
-def test_a_seed_gives_the_same_bytes_in_every_process():
-    command = [sys.executable, "-c", DIGESTS]
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_seed_gives_the_same_bytes_in_every_process(engine):
+    pytest.importorskip(engine, reason=f"{engine} is not installed")
+    command = [sys.executable, "-c", DIGESTS, engine]
     outputs = [subprocess.check_output(command, text=True) for _ in range(2)]
     assert outputs[0] == outputs[1]
     assert outputs[0].count("\n") == 5
@@ -133,7 +150,8 @@ def test_a_seed_gives_the_same_bytes_in_every_process():
 
 
 def test_contacts_can_be_with_the_convex_parts(capfd):
-    settings = ProbingSettings(collision_mesh="vhacd")
+    pytest.importorskip("pybullet", reason="pybullet is not installed")
+    settings = ProbingSettings(collision_mesh="vhacd", engine="pybullet")
     session = open_probing(
         "simulated", _mesh("can"), configuration_name="can", settings=settings, seed=0
     )
@@ -142,9 +160,31 @@ def test_contacts_can_be_with_the_convex_parts(capfd):
     assert capfd.readouterr().out == ""  # the decomposition is talkative
 
 
-def test_without_pybullet_the_error_names_the_other_session(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(SessionError, match="session=kinematic"):
+def test_mujoco_touches_the_mesh_itself():
+    settings = ProbingSettings(collision_mesh="vhacd", engine="mujoco")
+    with pytest.raises(SettingError, match="collision_mesh is vhacd; accepted in mujoco: visual"):
+        open_probing("simulated", _mesh("can"), configuration_name="can", settings=settings, seed=0)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_engine_that_is_not_installed_is_one_line_with_the_other_sessions(engine, monkeypatch):
+    (other,) = {*ENGINES} - {engine}
+    missing = {engine}
+    monkeypatch.setattr(physics_engine, "find_spec", lambda name: None if name in missing else 1)
+    with pytest.raises(
+        SessionError,
+        match=f"engine {engine} is not installed .*: session.engine={other} or session=kinematic",
+    ):
+        open_probing(
+            "simulated",
+            _mesh("can"),
+            configuration_name="can",
+            settings=ProbingSettings(engine=engine),
+            seed=0,
+        )
+    assert physics_engine.default_engine() == other
+    missing |= {other}
+    with pytest.raises(SessionError, match=r"is not installed .*; accepted: session=kinematic"):
         open_probing(
             "simulated", _mesh("can"), configuration_name="can", settings=ProbingSettings(), seed=0
         )

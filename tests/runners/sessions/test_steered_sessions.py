@@ -13,17 +13,19 @@ from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
 from runners.objects.loader import load_model
 from runners.sessions.gripper import X_REST
+from runners.sessions.physics_engine import ENGINES
 from runners.sessions.probing import open_probing
 from runners.sessions.probing_settings import ProbingSettings
 
 
-@pytest.fixture(params=["kinematic", "simulated"])
+@pytest.fixture(params=["kinematic", *ENGINES])
 def session(request):
-    if request.param == "simulated":
-        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
-    opened = open_probing(
-        request.param, _mustard(), configuration_name="mustard", settings=ProbingSettings(), seed=0
-    )
+    kind, engine = "kinematic", None
+    if request.param in ENGINES:
+        pytest.importorskip(request.param, reason=f"{request.param} is not installed")
+        kind, engine = "simulated", request.param
+    settings = ProbingSettings(engine=engine)
+    opened = open_probing(kind, _mustard(), configuration_name="mustard", settings=settings, seed=0)
     yield opened
     opened.close()
 

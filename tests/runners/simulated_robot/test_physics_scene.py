@@ -10,6 +10,7 @@ from chsel.errors import SessionError
 from chsel.problem.poses import apply
 from chsel.problem.streams import Purpose, StreamKey
 from runners.objects.loader import load_model
+from runners.sessions.physics_engine import ENGINES
 from runners.simulated_robot import cabinet
 from runners.simulated_robot.cabinet import (
     CABINET_CONFIGURATIONS,
@@ -28,10 +29,8 @@ from runners.simulated_robot.noise import (
     stereo_depth,
 )
 from runners.simulated_robot.pads import TAUTNESS, Membrane
-from runners.simulated_robot.physics_scene import NEAR, PhysicsScene
+from runners.simulated_robot.scene import NEAR, open_scene
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings
-
-pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
 
 MESH = load_model("drill")
 POSE = stood_on_shelf(MESH, CABINET_CONFIGURATIONS["cabinet_drill"])
@@ -39,9 +38,10 @@ HAND = cabinet.world_from_wrist(np.add(REST, [0.12, 0.0, 0.0]))
 EXACT = 2e-5  # m
 
 
-@pytest.fixture(scope="module")
-def scene():
-    with closing(PhysicsScene(MESH, POSE)) as scene:
+@pytest.fixture(scope="module", params=ENGINES)
+def scene(request):
+    pytest.importorskip(request.param, reason=f"{request.param} is not installed")
+    with closing(open_scene(MESH, POSE, engine=request.param)) as scene:
         yield scene
 
 

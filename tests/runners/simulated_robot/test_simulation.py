@@ -21,8 +21,6 @@ from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS, REST, world_
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
 from runners.simulated_robot.simulation import START, TICK, SimulatedLog, simulate_log
 
-pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
-
 CONFIGURATION = CABINET_CONFIGURATIONS["cabinet_mustard"]
 MESH = load_model("mustard")
 SEED = 3

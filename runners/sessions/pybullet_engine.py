@@ -3,39 +3,42 @@
 from __future__ import annotations
 
 import tempfile
-from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import apply, compose, inverse
+from chsel.problem.poses import compose
 from runners.sessions.configurations import Configuration
 from runners.sessions.faults import probed_mesh
 from runners.sessions.gripper import START, Touch
 from runners.sessions.mesh_surface import MeshSurface
 from runners.sessions.physics_engine import connect, silent
-from runners.sessions.placement import centre_of_mass, laid_down, lowest, on_stand
+from runners.sessions.placement import laid_down, on_stand
 from runners.sessions.probing_hand import ProbingHand, turned_from_forward
 from runners.sessions.probing_settings import ProbingSettings
+from runners.sessions.settling import (
+    FLOOR_FRICTION,
+    FLOOR_SPINNING_FRICTION,
+    GRAVITY,
+    OBJECT_MASS,
+    SETTLING_STEPS,
+    settled_mesh,
+    settling_body,
+)
+from runners.sessions.touch_readings import (
+    HAND_MASS,
+    MINI_STEP,
+    TIME_STEP,
+    Reading,
+    TouchReadings,
+)
 
 if TYPE_CHECKING:
     import trimesh
 
-TIME_STEP = 1.0 / 240.0  # s
-GRAVITY = -10.0  # m/s^2
-FLOOR_FRICTION = 0.6
-FLOOR_SPINNING_FRICTION = 0.8
 FINGER_FRICTION = 2.0
-SETTLING_STEPS = 1000
-OBJECT_MASS = 2.0  # kg, while it settles
-HAND_MASS = 0.9  # kg
-LETTING_GO = 0.001  # m: how far above the floor the object is let go
-MINI_STEP = 21  # steps of the engine
-FORCE_STEP = 5  # of a mini-step: when the force is read
-READINGS = 50  # how many readings of contact are looked back upon
-ENOUGH_READINGS = 2
 
 
 class PyBulletEngine:
@@ -54,12 +57,8 @@ class PyBulletEngine:
         Raise SessionError where PyBullet is not installed.
         """
         self._max_force = settings.max_force
-        self._readings: deque[_Reading | None] = deque(maxlen=READINGS)
-        self._began: _Reading | None = None
-        self._normal = np.zeros(3)  # of the object's face where the touch began
-        self._world: Any = connect(
-            "use session=kinematic, the same session without a physics engine"
-        )
+        self._readings = TouchReadings()
+        self._world: Any = connect()
         # Every access to a function of the client makes it; these are called most.
         self._step, self._contacts = self._world.stepSimulation, self._world.getContactPoints
         try:
@@ -89,24 +88,10 @@ class PyBulletEngine:
         """Draw the hand towards target (3,) for the time of one mini-step."""
         world = self._world
         world.changeConstraint(self._holder, target.tolist(), maxForce=self._max_force)
-        force = 0.0
         for step in range(MINI_STEP):
             self._step()
-            reading = self._read()
-            if reading is not None and not any(self._readings):
-                self._began = reading
-                # The engine's is the hand's where that meets an edge, or across both edges.
-                self._normal = self._surface.facing_normal(reading.contact, reading.normal)
-            self._readings.append(reading)
-            if step == FORCE_STEP and reading is not None:
-                force = reading.force
-        position = np.array(world.getBasePositionAndOrientation(self._hand)[0])
-        touching = sum(reading is not None for reading in self._readings)
-        if self._began is None or touching < ENOUGH_READINGS:
-            return Touch(position, force)
-        # As the hand presses on, the engine's contact wanders over the faces that touch by some
-        # millimetres; where the touch began is known best.
-        return Touch(position, force, contact=self._began.contact, normal=self._normal)
+            self._readings.add(step, self._read(), surface=self._surface)
+        return self._readings.touch(np.array(world.getBasePositionAndOrientation(self._hand)[0]))
 
     def place(self, pose: FloatArray) -> bool:
         """Put the hand at a pose (4, 4); False, and not to be used, if the object is there."""
@@ -118,7 +103,6 @@ class PyBulletEngine:
         world.resetBasePositionAndOrientation(self._hand, position, quaternion)
         world.changeConstraint(self._holder, position, quaternion, maxForce=self._max_force)
         self._readings.clear()
-        self._began = None
         near = world.getClosestPoints(self._hand, self._object, 0.0)
         return not any(record[_DISTANCE] < 0.0 for record in near)
 
@@ -134,7 +118,7 @@ class PyBulletEngine:
         if self._world.isConnected():
             self._world.disconnect()
 
-    def _read(self) -> _Reading | None:
+    def _read(self) -> Reading | None:
         """Return the contact between hand and object after a step, where it presses hardest."""
         touching = self._contacts(self._hand, self._object)
         records = [record for record in touching if record[_FORCE] > 0.0]
@@ -144,13 +128,7 @@ class PyBulletEngine:
         total = np.sum(forces, axis=0)
         hardest = max(records, key=lambda record: record[_FORCE])
         contact, normal = np.array(hardest[_POINT_ON_B]), np.array(hardest[_NORMAL_ON_B])
-        return _Reading(contact, normal, force=float(np.sqrt(total @ total)))
-
-
-class _Reading(NamedTuple):
-    contact: FloatArray  # (3,), on the object
-    normal: FloatArray  # (3,), across what touches, from the object to the hand
-    force: float  # on the hand, newtons
+        return Reading(contact, normal, force=float(np.sqrt(total @ total)))
 
 
 # Where a contact record of PyBullet has what; B is the object.
@@ -171,23 +149,14 @@ def _set_up(world: Any) -> None:
 
 
 def _settle(world: Any, mesh: trimesh.Trimesh, *, laid: FloatArray) -> FloatArray:
-    """Return the pose (4, 4) at which the mesh has settled under gravity from pose `laid`.
-
-    On a plane only the convex hull can touch; mass and inertia are those of the mesh itself.
-    """
-    solid = mesh if mesh.is_watertight else mesh.convex_hull
-    inertia, axes = np.linalg.eigh(solid.moment_inertia * (OBJECT_MASS / solid.mass))
-    axes[:, 2] *= np.linalg.det(axes)
-    object_from_inertial = compose(axes, centre_of_mass(mesh))
-    body_pose = laid @ object_from_inertial
-    body_pose[2, 3] += LETTING_GO
-    vertices = apply(inverse(object_from_inertial), np.asarray(mesh.convex_hull.vertices))
+    """Return the pose (4, 4) at which the mesh has settled under gravity from pose `laid`."""
+    settling = settling_body(mesh, laid)
     body = world.createMultiBody(
         OBJECT_MASS,
-        world.createCollisionShape(world.GEOM_MESH, vertices=vertices.tolist()),
-        **_placed(body_pose),
+        world.createCollisionShape(world.GEOM_MESH, vertices=settling.vertices.tolist()),
+        **_placed(settling.world_from_inertial),
     )
-    world.changeDynamics(body, -1, localInertiaDiagonal=inertia.tolist())
+    world.changeDynamics(body, -1, localInertiaDiagonal=settling.inertia.tolist())
     world.setGravity(0.0, 0.0, GRAVITY)
     for _ in range(SETTLING_STEPS):
         world.stepSimulation()
@@ -196,9 +165,7 @@ def _settle(world: Any, mesh: trimesh.Trimesh, *, laid: FloatArray) -> FloatArra
     # From here on only the hand moves, and what holds it carries its weight.
     world.setGravity(0.0, 0.0, 0.0)
     rotation = np.array(world.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
-    settled = compose(rotation, np.array(position)) @ inverse(object_from_inertial)
-    settled[2, 3] -= lowest(mesh, settled)  # the engine lets bodies hover by its margin
-    return settled
+    return settled_mesh(mesh, settling, world_from_inertial=compose(rotation, np.array(position)))
 
 
 def _collision_file(world: Any, mesh: trimesh.Trimesh, *, folder: Path, kind: str) -> Path:

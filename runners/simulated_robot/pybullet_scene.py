@@ -11,24 +11,23 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import compose, inverse
+from chsel.problem.poses import inverse
 from runners.sensors.rig import BoxRig
 from runners.sessions.physics_engine import connect, silent
 from runners.simulated_robot import cabinet
+from runners.simulated_robot.scene import AWAY, NEAR
 from runners.simulated_robot.settings import RenderedCamera
 
-NEAR = 0.02  # m: how far around the hand contacts are looked for
-_AWAY = compose(np.eye(3), np.array([0.0, 0.0, -100.0]))  # the hand, where no camera sees it
 _DEPTH = 3  # in the answer of getCameraImage
 _DISTANCE = 8  # in a record of getClosestPoints
 
 
-class PhysicsScene:
-    """An object at its pose in the cabinet, and the hand, which goes wherever it is put."""
+class PyBulletScene:
+    """The scene in PyBullet; see `Scene`."""
 
     def __init__(self, mesh: trimesh.Trimesh, world_from_object: FloatArray) -> None:
         """Make the scene of a mesh in its frame, metres. Raise SessionError without PyBullet."""
-        self._world = connect("logs that it simulated can be read without it")
+        self._world = connect()
         surroundings = cabinet.mesh_of(cabinet.CABINET + cabinet.ROOM)
         with tempfile.TemporaryDirectory() as folder, silent():
             looks = {"object": mesh, "cabinet": surroundings, "hand": cabinet.whole_mesh()}
@@ -42,14 +41,14 @@ class PhysicsScene:
                 self._body(solid, look["object"], pose=world_from_object),
                 self._body(self._boxes(cabinet.CABINET), look["cabinet"], pose=np.eye(4)),
             ]
-            self._hand = self._body(self._boxes(cabinet.rigid_parts()), look["hand"], pose=_AWAY)
+            self._hand = self._body(self._boxes(cabinet.rigid_parts()), look["hand"], pose=AWAY)
 
     def depth(
         self,
         camera: RenderedCamera,
         world_from_camera: FloatArray,
         *,
-        world_from_wrist: FloatArray = _AWAY,
+        world_from_wrist: FloatArray = AWAY,
     ) -> FloatArray:
         """Return depth (H, W) along z, metres, camera.far for nothing; without a wrist, no hand.
 

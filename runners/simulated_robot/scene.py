@@ -1,0 +1,57 @@
+"""The robot cell in a physics engine: what its cameras see, and what touches."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import compose
+from runners.sessions.physics_engine import default_engine
+from runners.simulated_robot.settings import RenderedCamera
+
+if TYPE_CHECKING:
+    import trimesh
+
+NEAR = 0.02  # m: how far around the hand contacts are looked for
+AWAY = compose(np.eye(3), np.array([0.0, 0.0, -100.0]))
+"""Where no camera sees the hand."""
+
+
+class Scene(Protocol):
+    """An object at its pose in the cabinet, and the hand, which goes wherever it is put."""
+
+    def depth(
+        self,
+        camera: RenderedCamera,
+        world_from_camera: FloatArray,
+        *,
+        world_from_wrist: FloatArray = AWAY,
+    ) -> FloatArray:
+        """Return depth (H, W) along z, metres, camera.far for nothing; without a wrist, no hand.
+
+        Nothing nearer than camera.near is seen. Accurate to some micrometres.
+        """
+
+    def clearance(self, world_from_wrist: FloatArray) -> float:
+        """Return metres between the hand's rigid parts and anything, below 0 inside; up to NEAR."""
+
+    def close(self) -> None:
+        """Release the engine."""
+
+
+def open_scene(
+    mesh: trimesh.Trimesh, world_from_object: FloatArray, *, engine: str | None = None
+) -> Scene:
+    """Open the scene of a mesh in its frame, metres, in the engine of this name, or the default.
+
+    Raise SessionError where it is not installed.
+    """
+    if (engine or default_engine()) == "mujoco":
+        from runners.simulated_robot.mujoco_scene import MuJoCoScene
+
+        return MuJoCoScene(mesh, world_from_object)
+    from runners.simulated_robot.pybullet_scene import PyBulletScene
+
+    return PyBulletScene(mesh, world_from_object)
