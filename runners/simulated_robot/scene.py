@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import compose
-from runners.sessions.physics_engine import default_engine
 from runners.simulated_robot.settings import RenderedCamera
-
-if TYPE_CHECKING:
-    import trimesh
 
 NEAR = 0.02  # m: how far around the hand contacts are looked for
 AWAY = compose(np.eye(3), np.array([0.0, 0.0, -100.0]))
@@ -39,19 +35,3 @@ class Scene(Protocol):
 
     def close(self) -> None:
         """Release the engine."""
-
-
-def open_scene(
-    mesh: trimesh.Trimesh, world_from_object: FloatArray, *, engine: str | None = None
-) -> Scene:
-    """Open the scene of a mesh in its frame, metres, in the engine of this name, or the default.
-
-    Raise SessionError where it is not installed.
-    """
-    if (engine or default_engine()) == "mujoco":
-        from runners.simulated_robot.mujoco_scene import MuJoCoScene
-
-        return MuJoCoScene(mesh, world_from_object)
-    from runners.simulated_robot.pybullet_scene import PyBulletScene
-
-    return PyBulletScene(mesh, world_from_object)

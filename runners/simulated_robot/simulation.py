@@ -18,6 +18,7 @@ from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.sensing.depth_camera import PinholeCamera
 from replay.files import whole_file
 from runners.sessions.configurations import Configuration
+from runners.sessions.physics_engine import default_engine
 from runners.simulated_robot import log_writer
 from runners.simulated_robot.cabinet import (
     PADS,
@@ -30,7 +31,7 @@ from runners.simulated_robot.cabinet import (
 from runners.simulated_robot.log_writer import LogWriter
 from runners.simulated_robot.noise import bubble_depth, stereo_depth
 from runners.simulated_robot.pads import Pads
-from runners.simulated_robot.scene import Scene, open_scene
+from runners.simulated_robot.scene import Scene
 from runners.simulated_robot.settings import RobotSettings
 
 WORLD = "world"
@@ -109,6 +110,22 @@ def simulate_log(
         robot.move(np.array(HOME))
         robot.stand(settings.dwell)
     return SimulatedLog(world_from_object, tuple(pushes))
+
+
+def open_scene(
+    mesh: trimesh.Trimesh, world_from_object: FloatArray, *, engine: str | None = None
+) -> Scene:
+    """Open the scene of a mesh in its frame, metres, in the engine of this name, or the default.
+
+    Raise SessionError where it is not installed.
+    """
+    if (engine or default_engine()) == "mujoco":
+        from runners.simulated_robot.mujoco_scene import MuJoCoScene
+
+        return MuJoCoScene(mesh, world_from_object)
+    from runners.simulated_robot.pybullet_scene import PyBulletScene
+
+    return PyBulletScene(mesh, world_from_object)
 
 
 class _Robot:

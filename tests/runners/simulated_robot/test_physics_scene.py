@@ -29,8 +29,9 @@ from runners.simulated_robot.noise import (
     stereo_depth,
 )
 from runners.simulated_robot.pads import TAUTNESS, Membrane
-from runners.simulated_robot.scene import NEAR, open_scene
+from runners.simulated_robot.scene import NEAR
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings
+from runners.simulated_robot.simulation import open_scene
 
 MESH = load_model("drill")
 POSE = stood_on_shelf(MESH, CABINET_CONFIGURATIONS["cabinet_drill"])
