@@ -9,7 +9,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL = $(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint $(VENV)/constraints.txt
 
-.PHONY: help probe check lint test test-all docs mutants clean
+.PHONY: help probe check lint test test-all docs newest mutants clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' Makefile | expand -t 10
@@ -29,6 +29,11 @@ lint: $(VENV)/.installed-test ## linter, format and types
 test: lint ## the checks of every commit
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
+newest: $(VENV)-newest/bin/python ## the tests with the newest versions in range, in .venv-newest, before a release
+	$(VENV)-newest/bin/python -m pip install --quiet $(PIP_ARGS) --upgrade --upgrade-strategy eager --editable ".[test]"
+	@$(VENV)-newest/bin/python -m pip freeze --exclude-editable | grep -vixFf constraints.txt || true
+	$(VENV)-newest/bin/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+
 test-all: $(VENV)/.installed-test ## all tests, with those that take long and rarely fail
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "slow or not slow"
 
@@ -42,11 +47,11 @@ mutants: $(VENV)/.installed-test ## how many single mistakes the tests of ROOM=c
 	$(INSTALL) --editable ".[mutants]"
 	$(BIN)/python -m tests.tools.mutants $(ROOM)
 
-$(VENV)/bin/python:
+$(VENV)/bin/python $(VENV)-newest/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "$(PYTHON) is older than Python 3.11; pass PYTHON=python3.11 or newer"; exit 2; }
-	@$(PYTHON) -m venv $(VENV_ARGS) $(VENV) || \
-		{ rm -rf $(VENV); echo "no virtual environment: on Debian, apt install python3-venv"; exit 2; }
+	@$(PYTHON) -m venv $(VENV_ARGS) $(@D:/bin=) || \
+		{ rm -rf $(@D:/bin=); echo "no virtual environment: on Debian, apt install python3-venv"; exit 2; }
 
 # A torch that is there stays, whatever its version: it is the largest part by far.
 $(VENV)/constraints.txt: constraints.txt | $(VENV)/bin/python
@@ -54,7 +59,7 @@ $(VENV)/constraints.txt: constraints.txt | $(VENV)/bin/python
 		then sed '/^torch==/d' constraints.txt; else cat constraints.txt; fi > $@
 
 $(VENV)/.installed: pyproject.toml $(VENV)/constraints.txt
-	$(INSTALL) --editable ".[all]"
+	$(INSTALL) --editable ".[sim,sensors,evaluate,serve]"  # "all" without torch
 	@touch $@
 
 $(VENV)/.installed-test: $(VENV)/.installed
@@ -62,4 +67,4 @@ $(VENV)/.installed-test: $(VENV)/.installed
 	@touch $@
 
 clean: ## delete the environment and all that was built
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) $(VENV)-newest build dist *.egg-info

@@ -21,7 +21,7 @@ from tests.runners.sensors.test_depth_frame import written as depth_frame
 pytestmark = pytest.mark.slow
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
 SCRIPTS = tuple(PROJECT["scripts"])
-VERSIONS = ("3.11", "3.12", "3.13")
+VERSIONS = ("3.11", "3.12", "3.13", "3.14")
 OF_BOX = "session=points session.path=points.npz object=mesh object.path=box.stl"
 SMALL = "method=gradient_descent method.descent.restarts=1 method.descent.iterations=5"
 LAUNCHED = f"chsel-probe -m {OF_BOX} {SMALL} seed=0,1 recording=mcap hydra/launcher="

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import difflib
 import multiprocessing
 import os
@@ -70,6 +71,9 @@ class _Job:
             print_page(_help(self.config_name, words))
             return
         sys.argv[1:] = words  # where hydra.main takes them from
+        if sys.version_info >= (3, 14):
+            # argparse checks every help text since, and refuses that of Hydra, which is lazy.
+            argparse.ArgumentParser._check_help = lambda self, action: None  # type: ignore
         hydra.main(version_base="1.3", config_path=str(CONF), config_name=self.config_name)(self)()
 
     def __call__(self, config: DictConfig) -> None:
