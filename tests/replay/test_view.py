@@ -161,7 +161,7 @@ def test_topics_types_counts_and_rates_of_a_log(tmp_path, capsys):
     [
         ("none.mcap", None, "does not exist; accepted: "),
         ("x.mcap", b"\x89MCAP0\r\n\x01", "has no session in it"),
-        ("x.bag", b"#ROSBAG V2.0\n", "`rosbags-convert --src LOG.bag"),
+        ("x.bag", b"#ROSBAG V2.0\n", "cannot be read as a ROS 1 bag"),
     ],
 )
 def test_what_is_no_log_is_an_error_of_one_line(tmp_path, capsys, name, data, message):
