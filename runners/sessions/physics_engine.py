@@ -54,9 +54,15 @@ def connect() -> Any:
     """Return a new world of PyBullet. Raise SessionError where it is not installed."""
     require_engine("pybullet")
     with silent():
-        import pybullet
-        from pybullet_utils.bullet_client import BulletClient
-
+        try:
+            import pybullet
+            from pybullet_utils.bullet_client import BulletClient
+        except ImportError as error:  # as of one that was built for another numpy
+            reason = " ".join(str(error).split())
+            raise SessionError(
+                f"the physics engine pybullet is installed and cannot be imported ({reason}); "
+                f"accepted: session.engine=mujoco or {_WITHOUT}"
+            ) from None
         return BulletClient(pybullet.DIRECT)
 
 
