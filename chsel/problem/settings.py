@@ -61,16 +61,27 @@ class CheckedSettings:
     """Base of settings whose annotations say what their fields accept.
 
     A field `rate: Annotated[float, positive]` raises SettingError for other values; None passes
-    where the type has it. A class that checks more, such as pairs of fields, extends __post_init__.
+    where the type has it, within Annotated or beside it. A class that checks more, such as pairs of
+    fields, extends __post_init__.
     """
 
     def __post_init__(self) -> None:
         for name, hint in _hints(type(self)).items():
-            if typing.get_origin(hint) is Annotated:
-                value = getattr(self, name)
-                if value is not None or type(None) not in typing.get_args(hint.__origin__):
-                    for check in hint.__metadata__:
+            value = getattr(self, name)
+            for checked in _annotated(hint):
+                if value is not None or type(None) not in (
+                    *typing.get_args(hint),
+                    *typing.get_args(checked.__origin__),
+                ):
+                    for check in checked.__metadata__:
                         check(name, value)
+
+
+def _annotated(hint: Any) -> list[Any]:
+    """Return the hint, or those of a union, that are Annotated."""
+    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    hints = typing.get_args(hint) if union else (hint,)
+    return [each for each in hints if typing.get_origin(each) is Annotated]
 
 
 def build_settings(

@@ -56,6 +56,7 @@ class Checked(CheckedSettings):
     length: Annotated[float, between(1e-3, 10.0)] = 1.0
     name: Annotated[str, one_of("a", "b")] = "a"
     limit: Annotated[float | None, positive, at_most(5.0)] = None
+    side: Annotated[float, positive] | None = None
     free: float = -1.0
 
     def __post_init__(self):
@@ -72,6 +73,7 @@ class Checked(CheckedSettings):
         ({"count": 1_001}, "count is 1001; accepted: at most 1_000"),
         ({"length": 20.0}, r"length is 20.0; accepted: 0.001 to 10 (m)"),
         ({"limit": 6.0}, "limit is 6.0; accepted: at most 5.0"),
+        ({"side": 0.0}, "side is 0.0; accepted: a finite number above 0"),
         ({"limit": 0.5}, "rate is 1.0; accepted: at most limit"),
         ({"limit": 0.5, "name": "c"}, "name is 'c'; accepted: a, b"),
     ],
@@ -82,7 +84,7 @@ def test_settings_accept_what_their_annotations_and_their_class_accept(values, m
 
 
 def test_values_at_the_limits_and_none_pass_where_the_type_has_it():
-    limits = Checked(count=1_000, length=10.0, limit=5.0)
+    limits = Checked(count=1_000, length=10.0, limit=5.0, side=0.1)
     assert build_settings(Checked, settings_mapping(limits), where="settings") == limits
     assert build_settings(Checked, {"limit": None, "rate": 2}, where="settings") == Checked(
         rate=2.0
