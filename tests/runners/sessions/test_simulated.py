@@ -24,6 +24,7 @@ from runners.sessions.probing_settings import ProbingSettings
 
 SCALES = {"cracker_box": 1.5, "clamp": 5.0}
 AGREEMENT = 0.003  # m
+SETTLED = {"mujoco": 0.0001, "pybullet": 0.001}  # m
 PRESSED = 0.0005  # m: how far 30 N press the hand into the object before the engine resists
 
 MANY = ("clamp_sideways", "drill", "drill_fallen", "hammer", "hammer_fallen", "mustard_fallen")
@@ -133,10 +134,11 @@ def test_free_space_is_nearly_that_of_plain_geometry(pair):
 
 def test_the_settled_object_lies_on_the_floor_where_geometry_has_laid_it(pair, request):
     assert lowest(pair.mesh, pair.world_from_object) == pytest.approx(0.0, abs=1e-9)
-    laid = laid_down(pair.mesh, CONFIGURATIONS[request.node.callspec.params["pair"][1]])
+    engine, name = request.node.callspec.params["pair"]
+    laid = laid_down(pair.mesh, CONFIGURATIONS[name])
     vertices = np.asarray(pair.mesh.vertices)
     moved = apply(pair.world_from_object, vertices) - apply(laid, vertices)
-    assert np.sqrt((moved**2).sum(axis=1)).max() < 0.001
+    assert np.sqrt((moved**2).sum(axis=1)).max() < SETTLED[engine]
 
 
 @pytest.mark.parametrize("engine", ENGINES)
