@@ -64,6 +64,10 @@ class MeshSurface:
         outside = ((points - nearest) * normals).sum(axis=1) >= 0.0
         return np.where(outside, 1.0, -1.0) * np.sqrt(squared), nearest, self._face_normals[face]
 
+    def encloses(self, point: FloatArray) -> bool:
+        """Return whether a point (3,) is inside."""
+        return bool(self.closest(point[None])[0][0] < 0.0)
+
     def facing_normal(self, point: FloatArray, direction: FloatArray) -> FloatArray:
         """Return the normal (3,) of the face nearest to a point (3,).
 

@@ -136,7 +136,8 @@ class MuJoCoEngine:
         self._target = pose[:3, 3].copy()
         self._readings.clear()
         self._mujoco.mj_forward(self._model, data)
-        return data.ncon == 0 and bool(self._surface.closest(pose[None, :3, 3])[0][0] > 0.0)
+        # Nothing of a surface touches a hand that is all inside of it.
+        return data.ncon == 0 and not self._surface.encloses(pose[:3, 3])
 
     def move(self, world_from_object: FloatArray) -> None:
         """Put the object at a pose (4, 4)."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from chsel.errors import SessionError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import compose
 from runners.sessions.configurations import Configuration
@@ -54,7 +55,7 @@ class PyBulletEngine:
     ) -> None:
         """Settle the object of a configuration, fix it, and put the hand at its start.
 
-        Raise SessionError where PyBullet is not installed.
+        Raise SessionError where PyBullet is not installed, or cannot hold the mesh.
         """
         self._max_force = settings.max_force
         self._readings = TouchReadings()
@@ -64,7 +65,9 @@ class PyBulletEngine:
         try:
             _set_up(self._world)
             with tempfile.TemporaryDirectory() as folder:
-                settled = _settle(self._world, mesh, laid=laid_down(mesh, configuration))
+                laid = laid_down(mesh, configuration)
+                with silent():  # of a mesh that it cannot hold, the engine prints a line
+                    settled = _settle(self._world, mesh, laid=laid)
                 self.world_from_object = on_stand(settled, configuration)
                 probed = probed_mesh(mesh, settings.faults)
                 file = _collision_file(
@@ -77,6 +80,12 @@ class PyBulletEngine:
                     self._world, file, world_from_object=self.world_from_object, concave=concave
                 )
                 self._hand = _hand(self._world, hand, folder=Path(folder))
+        except self._world.error as error:
+            self.close()
+            raise SessionError(
+                f"PyBullet cannot hold the object's mesh of {len(mesh.faces)} faces ({error}); "
+                "accepted: fewer faces, session.engine=mujoco or session=kinematic"
+            ) from None
         except BaseException:
             self.close()
             raise
@@ -104,7 +113,9 @@ class PyBulletEngine:
         world.changeConstraint(self._holder, position, quaternion, maxForce=self._max_force)
         self._readings.clear()
         near = world.getClosestPoints(self._hand, self._object, 0.0)
-        return not any(record[_DISTANCE] < 0.0 for record in near)
+        # Nothing of a surface touches a hand that is all inside of it.
+        inside = self._surface.encloses(pose[:3, 3])
+        return not inside and not any(record[_DISTANCE] < 0.0 for record in near)
 
     def move(self, world_from_object: FloatArray) -> None:
         """Put the object at a pose (4, 4)."""

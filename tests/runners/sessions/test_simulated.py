@@ -11,15 +11,15 @@ import trimesh
 from chsel.errors import SessionError, SettingError
 from chsel.events import Probe
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import apply, inverse
+from chsel.problem.poses import apply, compose, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from runners.objects.loader import load_model
 from runners.sessions import physics_engine
-from runners.sessions.configurations import CONFIGURATIONS
+from runners.sessions.configurations import CONFIGURATIONS, FITTED
 from runners.sessions.physics_engine import ENGINES
 from runners.sessions.placement import laid_down, lowest
 from runners.sessions.probing import open_probing
-from runners.sessions.probing_hand import panda_hand
+from runners.sessions.probing_hand import ROTATION, panda_hand
 from runners.sessions.probing_settings import ProbingSettings
 
 SCALES = {"cracker_box": 1.5, "clamp": 5.0}
@@ -142,6 +142,19 @@ def test_the_settled_object_lies_on_the_floor_where_geometry_has_laid_it(pair, r
 
 
 @pytest.mark.parametrize("engine", ENGINES)
+def test_a_hand_inside_or_across_the_surface_is_at_no_clear_start(engine):
+    pytest.importorskip(engine, reason=f"{engine} is not installed")
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)  # m: longer than the hand
+    settings = ProbingSettings(engine=engine)
+    session = open_probing("simulated", ball, configuration_name=FITTED, settings=settings, seed=0)
+    centre = session.world_from_object[:3, 3]
+    offsets = ([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [-1.5, 0.0, 0.0])
+    clear = [session._engine.place(compose(ROTATION, centre + offset)) for offset in offsets]
+    session.close()
+    assert clear == [False, False, True]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 def test_a_seed_gives_the_same_bytes_in_every_process(engine):
     pytest.importorskip(engine, reason=f"{engine} is not installed")
     command = [sys.executable, "-c", DIGESTS, engine]
@@ -149,6 +162,14 @@ def test_a_seed_gives_the_same_bytes_in_every_process(engine):
     assert outputs[0] == outputs[1]
     assert outputs[0].count("\n") == 5
     assert "contact" in outputs[0]
+
+
+def test_a_mesh_that_pybullet_cannot_hold_is_one_line():
+    pytest.importorskip("pybullet", reason="pybullet is not installed")
+    ball = trimesh.creation.icosphere(subdivisions=7, radius=0.1)
+    settings = ProbingSettings(engine="pybullet")
+    with pytest.raises(SessionError, match=r"hold the object's mesh of 327680 faces .*=mujoco or"):
+        open_probing("simulated", ball, configuration_name=FITTED, settings=settings, seed=0)
 
 
 def test_contacts_can_be_with_the_convex_parts(capfd):
