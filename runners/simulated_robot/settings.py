@@ -64,10 +64,10 @@ class RobotSettings(CheckedSettings):
     """Settings of the robot's probes and sensors."""
 
     probes: Annotated[int | None, positive] = None  # of the configuration's grid; null: all
-    engine: Annotated[str, one_of(*ENGINES)] | None = None  # null: PyBullet if there, else MuJoCo
     camera: CameraSettings = field(default_factory=CameraSettings)
     bubbles: BubbleSettings = field(default_factory=BubbleSettings)
     push_steps: Annotated[int, number_between(1, 5)] = 5  # of 5 cm, of a push at most
     standing: Duration = 1.5  # seconds before the first probe
     dwell: Duration = 0.6  # seconds at the end of a push
     drop: Annotated[float, number_between(0, 0.9)] = 0.02  # part of the images that are lost
+    engine: Annotated[str, one_of(*ENGINES)] | None = None  # null: PyBullet if there, else MuJoCo
