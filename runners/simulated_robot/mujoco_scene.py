@@ -14,7 +14,7 @@ from chsel.problem.poses import rotated
 from runners.sensors.rig import BoxRig
 from runners.sessions.physics_engine import import_mujoco
 from runners.simulated_robot import cabinet
-from runners.simulated_robot.scene import AWAY, NEAR
+from runners.simulated_robot.scene import AWAY
 from runners.simulated_robot.settings import RenderedCamera
 
 _LOOKS, _UNSEEN = 0, 1  # groups of geoms: what cameras see, and what they do not
@@ -39,7 +39,6 @@ class MuJoCoScene:
         flex.name = "object"
         flex.dim = 2
         flex.radius = _RADIUS
-        flex.margin = NEAR
         flex.vertbody = ["object"]
         flex.vert = np.asarray(mesh.vertices).ravel()
         flex.elem = np.asarray(mesh.faces).ravel()
@@ -84,11 +83,11 @@ class MuJoCoScene:
         depth[met] = found[met]
         return depth.reshape(camera.height, camera.width)
 
-    def clearance(self, world_from_wrist: FloatArray) -> float:
-        """Return the least distance of the contacts within NEAR."""
+    def is_blocked(self, world_from_wrist: FloatArray) -> bool:
+        """Return whether there is a contact, which is always of the hand."""
         self._place(world_from_wrist)
         self._mujoco.mj_collision(self._model, self._data)
-        return float(min(self._data.contact.dist, default=NEAR))
+        return bool((self._data.contact.dist <= 0.0).any())
 
     def close(self) -> None:
         """Release nothing, as the engine's memory goes with this object."""
@@ -123,7 +122,6 @@ class MuJoCoScene:
                 pos=list(box.position),
                 quat=Rotation.from_euler("xyz", box.rotation).as_quat(scalar_first=True),
                 group=group,
-                margin=0.5 * NEAR,
             )
 
 

@@ -15,7 +15,7 @@ from chsel.problem.poses import inverse
 from runners.sensors.rig import BoxRig
 from runners.sessions.physics_engine import connect, silent
 from runners.simulated_robot import cabinet
-from runners.simulated_robot.scene import AWAY, NEAR
+from runners.simulated_robot.scene import AWAY
 from runners.simulated_robot.settings import RenderedCamera
 
 _DEPTH = 3  # in the answer of getCameraImage
@@ -69,15 +69,14 @@ class PyBulletScene:
         buffer = np.asarray(image[_DEPTH], dtype=np.float64).reshape(camera.height, camera.width)
         return camera.near * camera.far / (camera.far - (camera.far - camera.near) * buffer)
 
-    def clearance(self, world_from_wrist: FloatArray) -> float:
-        """Return metres between the hand's rigid parts and anything, below 0 inside; up to NEAR."""
+    def is_blocked(self, world_from_wrist: FloatArray) -> bool:
+        """Return whether the hand's rigid parts touch the object or the cabinet."""
         self._place(self._hand, world_from_wrist)
-        nearest = [
-            record[_DISTANCE]
+        return any(
+            record[_DISTANCE] <= 0.0
             for body in self._fixed
-            for record in self._world.getClosestPoints(self._hand, body, NEAR)
-        ]
-        return float(min(nearest, default=NEAR))
+            for record in self._world.getClosestPoints(self._hand, body, 0.0)
+        )
 
     def close(self) -> None:
         """Disconnect from the engine."""

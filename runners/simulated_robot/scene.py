@@ -10,7 +10,6 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import compose
 from runners.simulated_robot.settings import RenderedCamera
 
-NEAR = 0.02  # m: how far around the hand contacts are looked for
 AWAY = compose(np.eye(3), np.array([0.0, 0.0, -100.0]))
 """Where no camera sees the hand."""
 
@@ -30,8 +29,8 @@ class Scene(Protocol):
         Nothing nearer than camera.near is seen. Accurate to some micrometres.
         """
 
-    def clearance(self, world_from_wrist: FloatArray) -> float:
-        """Return metres between the hand's rigid parts and anything, below 0 inside; up to NEAR."""
+    def is_blocked(self, world_from_wrist: FloatArray) -> bool:
+        """Return whether the hand's rigid parts touch anything, or are in it."""
 
     def close(self) -> None:
         """Release the engine."""

@@ -182,7 +182,7 @@ class _Robot:
             way = _line(self._position, self._position + ahead, speed=PUSH_SPEED)
             for position in way:
                 self._arrive(position)
-                if self._scene.clearance(self._pose) <= 0.0:
+                if self._scene.is_blocked(self._pose):
                     return "hand"
                 if self._pads.touches(self._depths):
                     for _, position in zip(range(REACTION), way, strict=False):

@@ -7,7 +7,8 @@ import pytest
 import trimesh
 
 from chsel.errors import SessionError
-from chsel.problem.poses import apply
+from chsel.problem.poses import apply, inverse
+from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.streams import Purpose, StreamKey
 from runners.objects.loader import load_model
 from runners.sessions.physics_engine import ENGINES
@@ -29,7 +30,6 @@ from runners.simulated_robot.noise import (
     stereo_depth,
 )
 from runners.simulated_robot.pads import TAUTNESS, Membrane
-from runners.simulated_robot.scene import NEAR
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings
 from runners.simulated_robot.simulation import open_scene
 
@@ -84,13 +84,25 @@ def test_a_bubble_camera_sees_the_object_but_not_its_own_housing(scene):
     assert seen.min() > 0.06
 
 
-def test_clearance_is_the_distance_to_what_is_nearest(scene):
+def blocked(scene, *position):
+    return scene.is_blocked(cabinet.world_from_wrist(np.array(position)))
+
+
+def test_the_hand_is_blocked_where_it_touches_a_wall_or_the_object(scene):
     side = cabinet.mesh_of(cabinet.rigid_parts()).bounds[1, 1]  # the hand's y is the world's
-    for gap in (0.010, 0.003, -0.002):
-        beside_wall = np.array([0.75, 0.22 - gap - side, 0.45])
-        seen = scene.clearance(cabinet.world_from_wrist(beside_wall))
-        assert seen == pytest.approx(gap, abs=1e-4)
-    assert scene.clearance(cabinet.world_from_wrist(np.array([0.2, 0.0, 0.9]))) == NEAR
+    for gap in (0.010, 0.0005, -0.0005, -0.010):
+        assert blocked(scene, 0.75, 0.22 - gap - side, 0.45) == (gap < 0.0)
+    hand = cabinet.mesh_of(cabinet.rigid_parts())
+    points, _ = trimesh.remesh.subdivide_to_size(hand.vertices, hand.faces, 0.002)
+    outcomes = []
+    for x in np.arange(0.68, 0.80, 0.004):
+        placed = apply(cabinet.world_from_wrist(np.array([x, 0.02, 0.45])), points)
+        distance = mesh_sdf(MESH, apply(inverse(POSE), placed))[0].min()
+        if abs(distance) > 0.0005:
+            assert blocked(scene, x, 0.02, 0.45) == (distance < 0.0)
+            outcomes.append(distance < 0.0)
+    assert {*outcomes} == {True, False}
+    assert not blocked(scene, 0.2, 0.0, 0.9)
 
 
 @pytest.mark.parametrize("name", CABINET_CONFIGURATIONS)
