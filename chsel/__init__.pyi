@@ -24,6 +24,7 @@ from .next_probe.decision_problem import WeightedPoses as WeightedPoses
 from .numerics.threads import set_threads as set_threads
 from .policies import build_policy as build_policy
 from .problem.mesh import load_mesh as load_mesh
+from .problem.object_symmetry import ObjectSymmetry as ObjectSymmetry
 from .problem.points import KnownPoints as KnownPoints
 from .problem.points import Workspace as Workspace
 from .problem.pose_prior import PosePrior as PosePrior

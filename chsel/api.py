@@ -18,6 +18,7 @@ from chsel.errors import (
 from chsel.methods import MOST_NOISE, build_method, default_method, method_settings
 from chsel.problem.initial_sets import posed_problem
 from chsel.problem.mesh import clean_mesh
+from chsel.problem.object_symmetry import ObjectSymmetry
 from chsel.problem.points import (
     FREE_RESOLUTION,
     KnownPoints,
@@ -31,6 +32,7 @@ from chsel.problem.points import (
     same_place,
     workspace_around,
 )
+from chsel.problem.pose_distances import with_symmetry
 from chsel.problem.pose_prior import PosePrior
 from chsel.problem.poses import inverse
 from chsel.problem.pushes import Pushes
@@ -64,6 +66,7 @@ def register(
     initial_set: Any = None,
     pushes: Pushes | None = None,
     prior: PosePrior | None = None,
+    symmetry: ObjectSymmetry | None = None,
     previous: Hypotheses | None = None,
     resolution: float | None = None,
     free_resolution: float = FREE_RESOLUTION,
@@ -88,6 +91,8 @@ def register(
     pushes: that may have moved the object while points became known, counted as free, occupied and
     known, of which contacts come first; `anchored` finds where it is now.
     prior: what is known of the pose beforehand, before any push; read by `anchored` and by trust.
+    symmetry: turns after which the object counts as the same, by which verdict and modes go; by
+    default those that map its surface to itself.
     previous: the last result, when points were added since (CHSEL, Alg. 2). resolution: of the
     SDF grid of a mesh, metres; by default that of `SdfGrid.from_mesh`. The grid is kept for the
     next call with this mesh. free_resolution: voxel side of free space, metres; used by free_term
@@ -121,7 +126,7 @@ def register(
     method = default_method(preset) if method is None else method
     more = None if hypotheses is None else {"online": {"hypotheses": hypotheses}}
     solver = build_method(method, method_settings(method, preset, settings, more))
-    sdf = _grid(target, resolution)
+    sdf = with_symmetry(_grid(target, resolution), symmetry)
     require_metres("noise", noise_of(solver), most=MOST_NOISE * sdf.diameter, diameter=sdf.diameter)
     points, repeated = distinct_points(given, KnownPoints(), apart=same_place(sdf.diameter))
     if pushes is not None:  # which count the points

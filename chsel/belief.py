@@ -18,15 +18,14 @@ from chsel.errors import PoseError, SettingError, require_at_most, require_posit
 from chsel.events import Believed
 from chsel.next_probe.decision_problem import HandShape
 from chsel.numerics.arrays import FloatArray, IntArray, evenly_spaced, frozen
-from chsel.numerics.elementary import arctangents
-from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry
+from chsel.plausible.symmetry import grid_symmetry
 from chsel.problem.noise import LIMIT, noise_model
+from chsel.problem.object_symmetry import ObjectSymmetry
+from chsel.problem.pose_distances import distances_apart, turned
 from chsel.problem.poses import (
     Poses,
     apply,
-    axis_angle,
     compose,
-    hat,
     inverse,
     nearest_rigid,
     product,
@@ -38,8 +37,8 @@ from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, 
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import CheckedSettings
 from chsel.problem.streams import Purpose, StreamKey
-from chsel.problem.surface import outline_distances, signed_distances, surface_points
-from chsel.problem.trust import SENSOR_NOISE, pose_energies, turned
+from chsel.problem.surface import signed_distances, surface_points
+from chsel.problem.trust import SENSOR_NOISE, pose_energies
 from chsel.sensing.free_space import interior_lattice
 
 if TYPE_CHECKING:
@@ -157,7 +156,7 @@ class PoseBelief:
         """Return the modes; a member is of that whose best is nearest and not turned against it."""
         if len(firsts) == 0:
             return []
-        apart = outline_distances(self._sdf, self._poses)
+        apart = distances_apart(self._sdf, self._poses)
         every = np.ones_like(apart, dtype=bool)
         apart = apart + np.where(
             turned(self._sdf, self._poses, pairs=every), apart.max() + 1.0, 0.0
@@ -189,7 +188,7 @@ class PoseBelief:
         if before:
             old = Poses.of(np.stack([mode.object_from_world for mode in before]))
             both = Poses.joined([self._poses[firsts], old])
-            apart = outline_distances(self._sdf, both)
+            apart = distances_apart(self._sdf, both)
             away = apart + np.where(turned(self._sdf, both, pairs=apart < np.inf), np.inf, 0.0)
             away = away[: len(firsts), len(firsts) :]
             for at in np.argsort(away, axis=None, kind="stable"):
@@ -380,7 +379,7 @@ def pose_offsets(symmetry: ObjectSymmetry, own: FloatArray, *, others: FloatArra
     world_from_object = inverse(np.concatenate([own[None], others]))
     centres = apply(world_from_object, symmetry.centre[None])[:, 0]
     rotations = world_from_object[:, :3, :3]
-    turns = product(_nearest_alike(symmetry, rotations[0], others=rotations[1:]), rotations[0].T)
+    turns = product(symmetry.nearest(rotations[1:], rotations[0]), rotations[0].T)
     return np.concatenate([centres[1:] - centres[0], _rotation_vectors(turns)], axis=1)
 
 
@@ -412,24 +411,6 @@ def _nodes(gripper: Gripper) -> tuple[FloatArray, FloatArray]:
 
     fingers = lattice(across, np.concatenate([-outwards, outwards]), back)
     return fingers, lattice(across, np.linspace(-0.45, 0.45, 5), pad)
-
-
-def _nearest_alike(symmetry: ObjectSymmetry, own: FloatArray, *, others: FloatArray) -> FloatArray:
-    """Return rotations (M, 3, 3) that look as others do, as near to `own` (3, 3) as possible."""
-    if symmetry.sphere:
-        return np.broadcast_to(own, others.shape)
-    alike = product(others[:, None], symmetry.rotations)  # (M, S, 3, 3)
-    if symmetry.axis is not None:
-        # tr(own^T R turn(t)) = a + b cos t + c sin t about the axis
-        relative = product(own.T, alike)
-        along = symmetry.axis[:, None] * symmetry.axis
-        b = (relative * (np.eye(3) - along)).sum(axis=(-2, -1))
-        c = (relative * hat(symmetry.axis).T).sum(axis=(-2, -1))
-        angles = arctangents(c, b)
-        turns = axis_angle(np.broadcast_to(symmetry.axis, (*angles.shape, 3)), angles)
-        alike = product(alike, turns)
-    best = np.argmin(rotation_angle(product(own.T, alike)), axis=1)
-    return alike[np.arange(len(alike)), best]
 
 
 def _rotation_vectors(turns: FloatArray) -> FloatArray:

@@ -22,7 +22,7 @@ from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.threads import require_threads, threads
 from chsel.plausible.pose_metrics import pose_errors
-from chsel.plausible.symmetry import object_symmetry
+from chsel.plausible.symmetry import symmetry_of
 from chsel.problem.initial_sets import posed_problem
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, inverse
@@ -134,7 +134,7 @@ class RealCase:
         self._touches = self._given.points.contacts
         if len(self._touches) < 2:
             raise SettingError(f"{name} has {len(self._touches)} touches; accepted: from 2")
-        self._symmetry = object_symmetry(self._source.mesh)
+        self._symmetry = symmetry_of(self._given.sdf, self._source.mesh)
         self._config = config
         self._name = name
 

@@ -22,6 +22,7 @@ from chsel.numerics.elementary import exp, exp_in_lanes, exps, log, logs
 from chsel.numerics.threads import parallel_for
 from chsel.problem.noise import FACET, WRONG_NORMALS
 from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.pose_distances import distances_apart
 from chsel.problem.poses import Poses, compose, inverse, random_rotations, rotated
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.sdf_grid import SdfGrid
@@ -30,7 +31,6 @@ from chsel.problem.streams import Purpose, StreamKey, uniforms
 from chsel.problem.surface import (
     in_order,
     object_centre,
-    outline_distances,
     outline_in_world,
     signed_distances,
     surface_spread,
@@ -176,7 +176,7 @@ class Forecast:
     def distances(self) -> FloatArray:
         """Distances (K, K) of the surfaces in poses from each other, metres."""
         poses = Poses.of(self.problem.belief.object_from_world)
-        return outline_distances(self.problem.sdf, poses)
+        return distances_apart(self.problem.sdf, poses)
 
     @cached_property
     def spread(self) -> float:

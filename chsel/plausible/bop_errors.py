@@ -36,29 +36,43 @@ def declared_symmetries(info: Mapping[str, Any]) -> FloatArray:
 
     The identity first. Raise SettingError for an entry that is none.
     """
+    discrete, axes = model_symmetries(info, scale=METRES)
+    continuous = [np.eye(4)]
+    for direction, offset in axes:
+        axis = direction / np.sqrt((direction**2).sum())
+        count = math.ceil(math.pi / _STEP)
+        angles = np.arange(float(count)) * (2.0 * math.pi / count)
+        turns = axis_angle(np.tile(axis, (count, 1)), angles)
+        about = compose(turns, offset - rotated(turns, offset))
+        continuous += list(about[1:])
+    found = np.array([then @ first for first in [np.eye(4), *discrete] for then in continuous])
+    return frozen("symmetries", found, shape=(None, 4, 4), error=SettingError)
+
+
+def model_symmetries(info: Mapping[str, Any], *, scale: float) -> tuple[FloatArray, FloatArray]:
+    """Return turns (T, 4, 4) and axes (K, 2, 3) of an object's entry in models_info.json, metres.
+
+    As `chsel.ObjectSymmetry.declared` takes them. scale: metres in the unit of the entry. Raise
+    SettingError for an entry that is none.
+    """
     try:
-        discrete = [np.eye(4)]
-        for numbers in info.get("symmetries_discrete", []):
-            move = np.reshape(np.asarray(numbers, dtype=np.float64), (4, 4)).copy()
-            move[:3, 3] *= METRES
-            discrete.append(move)
-        continuous = [np.eye(4)]
-        for symmetry in info.get("symmetries_continuous", []):
-            axis = np.asarray(symmetry["axis"], dtype=np.float64)
-            axis = axis / np.sqrt((axis**2).sum())
-            offset = METRES * np.asarray(symmetry["offset"], dtype=np.float64)
-            count = math.ceil(math.pi / _STEP)
-            angles = np.arange(float(count)) * (2.0 * math.pi / count)
-            turns = axis_angle(np.tile(axis, (count, 1)), angles)
-            about = compose(turns, offset - rotated(turns, offset))
-            continuous += list(about[1:])
+        turns = np.zeros((0, 4, 4))
+        if info.get("symmetries_discrete"):
+            turns = np.array(info["symmetries_discrete"], dtype=np.float64).reshape(-1, 4, 4)
+        turns[:, :3, 3] *= scale
+        axes = np.zeros((0, 2, 3))
+        if info.get("symmetries_continuous"):
+            each = [(one["axis"], one["offset"]) for one in info["symmetries_continuous"]]
+            axes = np.array(each, dtype=np.float64).reshape(-1, 2, 3)
+        axes[:, 1] *= scale
+        if not (axes[:, 0] != 0.0).any(axis=1).all():
+            raise ValueError("an axis of length 0")
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise SettingError(
             f"models_info has symmetries that are not read ({' '.join(str(error).split())}); "
             "accepted: symmetries_discrete of 16 numbers, symmetries_continuous of axis and offset"
         ) from None
-    found = np.array([then @ first for first in discrete for then in continuous])
-    return frozen("symmetries", found, shape=(None, 4, 4), error=SettingError)
+    return turns, axes
 
 
 def bop_errors(

@@ -10,11 +10,12 @@ import numpy as np
 from chsel.errors import EvaluationError, SettingError
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.plausible.surface_distance import SurfaceDistance
-from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry
+from chsel.plausible.symmetry import grid_symmetry
+from chsel.problem.object_symmetry import ObjectSymmetry
+from chsel.problem.pose_distances import distances_apart_from
 from chsel.problem.poses import Poses, inverse, product, rotated
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.sdf_grid import FARTHEST, SdfGrid
-from chsel.problem.surface import outline_distances_to
 
 
 def pose_errors(
@@ -47,7 +48,7 @@ def closest_pose(
     readable = (np.abs(poses.numbers) <= FARTHEST).all(axis=1)
     readable &= (np.abs(truth.numbers) <= FARTHEST).all()
     distances = np.full(len(poses), np.inf)
-    distances[readable] = outline_distances_to(sdf, poses[readable], other=truth)
+    distances[readable] = distances_apart_from(sdf, poses[readable], other=truth)
     return int(np.argmin(distances))
 
 

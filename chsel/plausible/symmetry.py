@@ -5,17 +5,21 @@ They are searched on the surface: first for axes of revolution, then for a finit
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray, IntArray
-from chsel.numerics.elementary import arctangents
 from chsel.plausible.surface_distance import surface_points
 from chsel.problem.mesh import mesh_digest
-from chsel.problem.poses import axis_angle, product, rotated, rotation_angle, rotation_matrices
+from chsel.problem.object_symmetry import (
+    ObjectSymmetry,
+    angles_between,
+    distinct_turns,
+    generated,
+)
+from chsel.problem.poses import axis_angle, rotation_matrices
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from chsel.problem.surface import has_surface, object_centre
@@ -23,7 +27,6 @@ from chsel.problem.surface import has_surface, object_centre
 if TYPE_CHECKING:
     import trimesh
 
-_LARGEST_GROUP = 60  # the icosahedron's; a larger one cannot be distinguished from revolution
 _TOLERANCE = 0.0085  # of the diameter
 _TESTED = 1000  # points by which a rotation is tested
 _POINTS = 20_000  # points that mark the cells of the coarse grid
@@ -38,38 +41,7 @@ _NEIGHBOURS = 16
 _COARSE = 0.05  # of the diameter: coarse errors of rotations within 9 degrees of a symmetry
 _MOST_CANDIDATES, _MOST_ALIGNED = 400, 50
 _SAME = np.deg2rad(10.0)  # between two approximations of one element
-_IMPROVEMENTS = 5
 _FOUND: dict[str, ObjectSymmetry] = {}  # by digests of meshes
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectSymmetry:
-    """The symmetries of an object: proper rotations about its centre, in the object's frame.
-
-    They are `rotations` if there is no axis of revolution, their products with the rotations by all
-    angles about the axis if there is one, and all rotations for a sphere. By default the identity
-    alone, about the origin of the object's frame.
-    """
-
-    centre: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,), m
-    rotations: FloatArray = field(default_factory=lambda: np.eye(3)[None])  # (S, 3, 3)
-    axis: FloatArray | None = None  # (3,), unit, of revolution
-    sphere: bool = False  # whether all rotations are symmetries
-
-    def rotation_errors(self, relative: FloatArray) -> FloatArray:
-        """Return the smallest angles (B,), radians, of rotations (B, 3, 3) times a symmetry.
-
-        relative: object_from_world of an estimate times world_from_object of the truth. Over all
-        rotations about an axis u, the smallest angle of R times one is the angle from u to R u.
-        """
-        if self.sphere:
-            return np.zeros(len(relative))
-        turned = product(relative[:, None], self.rotations)  # (B, S, 3, 3)
-        if self.axis is None:
-            return rotation_angle(turned).min(axis=1)
-        moved = rotated(turned, self.axis)  # (B, S, 3)
-        sine = np.sqrt((np.cross(self.axis, moved) ** 2).sum(axis=-1))
-        return arctangents(sine, (self.axis * moved).sum(axis=-1)).min(axis=1)
 
 
 def object_symmetry(mesh: trimesh.Trimesh) -> ObjectSymmetry:
@@ -95,8 +67,15 @@ def object_symmetry(mesh: trimesh.Trimesh) -> ObjectSymmetry:
     return _FOUND[key]
 
 
+def symmetry_of(sdf: SdfGrid, mesh: trimesh.Trimesh) -> ObjectSymmetry:
+    """Return the symmetries that are declared of a grid's object, else those of its mesh."""
+    return object_symmetry(mesh) if sdf.symmetry is None else sdf.symmetry
+
+
 def grid_symmetry(sdf: SdfGrid) -> ObjectSymmetry:
-    """Return the identity alone, about the centre of an object whose mesh is not available."""
+    """Return the declared ones of an object without a mesh, else the identity about its centre."""
+    if sdf.symmetry is not None:
+        return sdf.symmetry
     return ObjectSymmetry(object_centre(sdf) if has_surface(sdf) else sdf.bounds.mean(axis=0))
 
 
@@ -244,15 +223,16 @@ def _finite_group(surface: RotatedSurface) -> FloatArray:
     least = np.flatnonzero((coarse <= coarse[neighbours].min(axis=1)) & (coarse <= _COARSE))
     least = least[np.argsort(coarse[least], kind="stable")][:_MOST_CANDIDATES]
     turns = surface.aligned(spread[least], steps=4, count=64)
-    turns = _distinct(_best_first(turns, surface.errors(turns, count=200), most=3.0), _MOST_ALIGNED)
+    turns = _best_first(turns, surface.errors(turns, count=200), most=3.0)
+    turns = distinct_turns(turns, _MOST_ALIGNED, same=_SAME)
     turns = surface.aligned(turns, steps=12, count=500)
     group = np.eye(3)[None]
     for turn in _best_first(turns, surface.errors(turns), most=1.0):
-        if _angles_between(turn[None], group).min() > _SAME:
-            larger = generated(np.array([*group, turn]))
+        if angles_between(turn[None], group).min() > _SAME:
+            larger = generated(np.array([*group, turn]), same=_SAME)
             if larger is not None and surface.errors(larger).max() <= 1.0:
                 group = larger
-    improved = generated(surface.aligned(group, steps=12, count=500))
+    improved = generated(surface.aligned(group, steps=12, count=500), same=_SAME)
     return group if improved is None else improved
 
 
@@ -280,46 +260,3 @@ def _spread() -> tuple[FloatArray, IntArray]:
     quaternion = np.array([radius * share for radius, share in pairs]).T
     _, index = cKDTree(np.concatenate([quaternion, -quaternion])).query(quaternion, k=_NEIGHBOURS)
     return rotation_matrices(quaternion), index % _SPREAD
-
-
-def _angles_between(turns: FloatArray, others: FloatArray) -> FloatArray:
-    """Return angles (T, O), radians, between rotations (T, 3, 3) and (O, 3, 3)."""
-    trace = turns.reshape(-1, 9) @ others.reshape(-1, 9).T
-    return np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))
-
-
-def _distinct(turns: FloatArray, most: int) -> FloatArray:
-    """Return rotations (T, 3, 3) without those near an earlier one, at most so many."""
-    kept: list[FloatArray] = []
-    while len(turns) and len(kept) < most:
-        kept.append(turns[0])
-        turns = turns[_angles_between(turns, turns[:1])[:, 0] > _SAME]
-    return np.array(kept).reshape(-1, 3, 3)
-
-
-def generated(turns: FloatArray) -> FloatArray | None:
-    """Return the group (S, 3, 3) of products of approximate rotations (T, 3, 3), identity first.
-
-    None if it has more than 60 elements, or is not a group. Every element is replaced by the mean
-    of what the table of products says it is, which converges to an exact group (Grove, Karcher and
-    Ruh, 1974, "Group actions and curvature").
-    """
-    turns = _distinct(np.concatenate([np.eye(3)[None], turns]), _LARGEST_GROUP + 1)
-    while True:
-        products = np.einsum("iab,jbc->ijac", turns, turns).reshape(-1, 3, 3)
-        angles = _angles_between(products, turns)
-        new = products[angles.min(axis=1) > _SAME]
-        if len(new) == 0:
-            break
-        turns = np.concatenate([turns, _distinct(new, _LARGEST_GROUP + 1)])
-        if len(turns) > _LARGEST_GROUP:
-            return None
-    table = angles.argmin(axis=1).reshape(len(turns), len(turns))
-    if (np.sort(table, axis=1) != np.arange(len(turns))).any():
-        return None
-    for _ in range(_IMPROVEMENTS):
-        means = np.einsum("jba,jkbc->kac", turns, turns[table])
-        left, _, right = np.linalg.svd(means)
-        turns = left @ right
-    turns[0] = np.eye(3)  # without the rounding
-    return turns

@@ -14,6 +14,7 @@ import numpy as np
 from chsel.errors import MeshError, MeshWarning, SdfError, quoted, require_choice, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, ShapesShown, digest, frozen
 from chsel.problem.mesh import mesh_digest
+from chsel.problem.object_symmetry import ObjectSymmetry
 
 if TYPE_CHECKING:
     import trimesh
@@ -97,6 +98,8 @@ class SdfGrid(ShapesShown):
     resolution: float  # node spacing, metres
     values: FloatArray  # (nx, ny, nz): signed distance in metres, negative inside
     gradients: FloatArray  # (nx, ny, nz, 3): unit gradients
+    # Of the object, as declared; None: the rotations that map its surface to itself.
+    symmetry: ObjectSymmetry | None = None
 
     def __post_init__(self) -> None:
         require_positive("SDF resolution", self.resolution)
@@ -220,7 +223,10 @@ class SdfGrid(ShapesShown):
     @cached_property
     def digest(self) -> str:
         """Digest of the grid."""
-        return digest(self.origin, np.array(self.resolution), self.values, self.gradients)
+        own = digest(self.origin, np.array(self.resolution), self.values, self.gradients)
+        if self.symmetry is None:
+            return own
+        return digest(np.frombuffer((own + self.symmetry.digest).encode(), dtype=np.uint8))
 
     @cached_property
     def table(self) -> FloatArray:

@@ -23,21 +23,17 @@ from chsel.problem.noise import (
     noise_model,
 )
 from chsel.problem.points import KnownPoints
-from chsel.problem.poses import (
-    Poses,
-    compose,
-    product,
-    rotated,
-    rotation_angle,
-    rotation_vector,
+from chsel.problem.pose_distances import (
+    angles_apart,
+    distances_apart,
+    distances_apart_from,
+    turned,
 )
+from chsel.problem.poses import Poses, compose, product, rotated, rotation_vector
 from chsel.problem.registration_problem import VERDICTS, Hypotheses, RegistrationProblem, Trust
 from chsel.problem.sdf_grid import FARTHEST, SdfGrid
 from chsel.problem.surface import (
     in_order,
-    outline_distances,
-    outline_distances_to,
-    outline_in_object,
     outline_in_world,
     signed_distances,
     surface_gradients,
@@ -66,8 +62,6 @@ NEAR_LIMIT = 1.5  # times LIMIT that moving a pose costs, below which the result
 LEAST_GAP = 2.0  # noise levels, as estimated, between modes
 SYSTEMATIC = 0.5  # correlation of the errors of neighbours
 MOST_NOISE = 0.015  # metres: contacts that are off by more, or three times the sensor's noise
-TURN = 0.5  # radians: poses turned by more are different modes, unless by a symmetry
-SYMMETRIC = 0.0085  # root mean square of what a symmetry moves the surface by, in diameters
 MANY_CONTACTS = 20  # among which one on another object would show
 FOREIGN_CONTACT = 4.0  # nats beyond LIMIT that a pose costs which leaves out one of few contacts
 _GRID_ERROR = 0.3  # of interpolated distances, in spacings of nodes
@@ -110,11 +104,12 @@ def trust_in(
     share = MOST_SYSTEMATIC if alike else MOST_OFF
     limit = max(share * sdf.diameter, _GRID_ERROR * sdf.resolution, LEAST_LEVELS * sensor_noise)
 
-    apart = outline_distances(sdf, poses)
+    apart = distances_apart(sdf, poses)
     width = max(MOST_WIDTH * sdf.diameter, LEAST_LEVELS * sensor_noise)
     gap = max(width, LEAST_GAP * noise.sigma)
     near = apart <= gap
-    count, mode = _components(near & ~turned(sdf, poses, pairs=near))
+    differ = turned(sdf, poses, pairs=near)
+    count, mode = _components(near & ~differ)
     parts = [np.flatnonzero(mode == one) for one in range(count)]
     redundancy = max(len(off) - FREEDOMS, 0)
     why = ""
@@ -135,6 +130,9 @@ def trust_in(
         why = f"{count} groups of poses"
     elif max(surface_spread(apart[np.ix_(part, part)]) for part in parts) > width:
         verdict = WIDE
+    elif sdf.symmetry is not None and any(differ[np.ix_(part, part)].any() for part in parts):
+        verdict = WIDE
+        why = "turns that are no declared symmetry look alike"
     else:
         bests = [poses[part[:1]] for part in parts]
         way = sure_within(sdf, sensor_noise)
@@ -220,51 +218,15 @@ def fits_elsewhere(
     best = Poses.of(hypotheses.object_from_world[:1])
     noise = noise_model(sensor_noise)
     limit = pose_energies(problem, best, noise=noise)[0] + LIMIT
-    apart = outline_distances_to(problem.sdf, poses, other=best)
+    apart = distances_apart_from(problem.sdf, poses, other=best)
     width = max(MOST_WIDTH * problem.sdf.diameter, LEAST_LEVELS * sensor_noise)
     return bool(((pose_energies(other, poses, noise=noise) <= limit) & (apart > width)).any())
-
-
-def turned(sdf: SdfGrid, poses: Poses, *, pairs: BoolArray) -> BoolArray:
-    """Return flags (B, B) of those pairs of poses that differ by a rotation that is no symmetry.
-
-    Such a rotation is larger than TURN, and about the object's middle it moves the surface by more
-    than SYMMETRIC of the diameter, root mean square.
-    """
-    one, other = np.nonzero(np.triu(pairs & (_angles(poses) > TURN), 1))
-    result = np.zeros_like(pairs)
-    turns = product(poses.rotations[one], np.swapaxes(poses.rotations[other], 1, 2))
-    outline, centre = outline_in_object(sdf), middle(sdf)
-    about = Poses.of(compose(turns, centre - rotated(turns, centre)))
-    squares = in_order(signed_distances(sdf, about, points=outline) ** 2) / max(len(outline), 1)
-    moved = np.sqrt(squares) > SYMMETRIC * sdf.diameter
-    result[one[moved], other[moved]] = True
-    return result | result.T
-
-
-def middle(sdf: SdfGrid) -> FloatArray:
-    """Return centroid (3,) of the object's volume, which every symmetry leaves where it is."""
-    return sdf.derived("middle", lambda: _middle(sdf))
-
-
-def _middle(sdf: SdfGrid) -> FloatArray:
-    share = np.clip(0.5 - sdf.values / sdf.resolution, 0.0, 1.0)  # of the cell around each node
-    inside = np.argwhere(share > 0.0)
-    if len(inside) == 0:
-        return np.asarray(sdf.bounds.mean(axis=0))
-    weights = share[tuple(inside.T)]
-    return sdf.origin + sdf.resolution * in_order(weights * inside.T) / in_order(weights)
-
-
-def _angles(poses: Poses) -> FloatArray:
-    """Return the angles (B, B), radians, between poses."""
-    return rotation_angle(product(poses.rotations[:, None], np.swapaxes(poses.rotations, 1, 2)))
 
 
 def _largest_turn(poses: Poses, apart: FloatArray, *, parts: list[IntArray]) -> tuple[float, float]:
     """Return the angle (radians) and distance (m) of the two modes that differ most."""
     firsts = [int(part[0]) for part in parts]
-    angles = _angles(poses[np.array(firsts)])
+    angles = angles_apart(poses[np.array(firsts)])
     one, other = np.unravel_index(int(np.argmax(angles)), angles.shape)
     return float(angles[one, other]), float(apart[firsts[one], firsts[other]])
 
@@ -402,9 +364,8 @@ def motion_cost(
         return math.inf
     moved = _moved(problem, pose, twists=distance * np.concatenate([motions, -motions]))
     energies = pose_energies(problem, Poses.joined([pose, moved]), noise=noise)
-    apart = outline_distances_to(
-        problem.sdf, moved, other=pose
-    )  # near for turns that are symmetries
+    # near for turns that are symmetries
+    apart = distances_apart_from(problem.sdf, moved, other=pose)
     rises = energies[1:] - energies[0]
     return float(rises[apart >= 0.5 * distance].min(initial=math.inf))
 

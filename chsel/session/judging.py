@@ -10,9 +10,11 @@ import numpy as np
 from chsel.errors import PointsWarning
 from chsel.methods.anchored.anchored import Anchored
 from chsel.methods.anchored.anchored_settings import AnchoredSettings
+from chsel.methods.anchored.near_symmetries import turns_alike
 from chsel.methods.anchored.pose_bound import pose_bound
 from chsel.methods.method import Method
 from chsel.problem.noise import noise_model
+from chsel.problem.pose_distances import TURN
 from chsel.problem.poses import Poses
 from chsel.problem.pushes import Pushes
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
@@ -54,20 +56,22 @@ def trust_by(
 
     None without a pose. A single mode has to stand beside what a search for other poses finds,
     among them turns under which the object looks nearly alike, and poses that leave out one of few
-    contacts. Of many contacts, `anchored` has done this search itself. Where pushes may have moved
-    the object, it has to stand also beside what is found for other distances of them. How far the
-    pose may be off is in `centre_within` and `turn_within`, by `pose_bound`; by more than
+    contacts. Turns that map the surface to itself are such poses where they are not among declared
+    symmetries. Of many contacts, `anchored` has done this search itself. Where pushes may have
+    moved the object, it has to stand also beside what is found for other distances of them. How far
+    the pose may be off is in `centre_within` and `turn_within`, by `pose_bound`; by more than
     `sure_within` or SURE_TURN, it is not determined.
     """
     if not has_pose(hypotheses):
         return None
     noise = noise_of(method)
     carried = problem.carried(hypotheses.push_distance)
-    rivals = None
-    trust = trust_in(carried, hypotheses, sensor_noise=noise)
+    rivals = _undeclared_copies(carried, hypotheses, noise=noise)
+    trust = trust_in(carried, hypotheses, sensor_noise=noise, rivals=rivals)
     searched = isinstance(method, Anchored) and len(carried.points.known) >= MANY_CONTACTS
     if trust.verdict == DETERMINED and not searched:
-        rivals = _search(noise).minima(carried)
+        found = _search(noise).minima(carried)
+        rivals = found if rivals is None else Poses.joined([rivals, found])
         trust = trust_in(carried, hypotheses, sensor_noise=noise, rivals=rivals)
     if trust.verdict == DETERMINED and _fits_other_pushes(problem, hypotheses, noise=noise):
         reason = "pushes of another length fit elsewhere"
@@ -80,6 +84,23 @@ def trust_by(
         reason = f"poses more than {limits} off explain the points"
         trust = replace(trust, verdict=WIDE, modes=0, reason=reason)
     return replace(trust, centre_within=centre, turn_within=turn)
+
+
+def _undeclared_copies(
+    problem: RegistrationProblem, hypotheses: Hypotheses, *, noise: float
+) -> Poses | None:
+    """Return the best pose after turns that map the surface to itself and are no symmetries.
+
+    No touch tells these poses from it. None where no symmetries are declared, as all such turns
+    are symmetries then.
+    """
+    sdf = problem.sdf
+    if sdf.symmetry is None:
+        return None
+    alike = turns_alike(sdf)
+    counted = sdf.symmetry.rotation_errors(alike[:, :3, :3]) <= TURN
+    copies = Poses.of(alike[~counted] @ hypotheses.object_from_world[0])
+    return _search(noise).fitted(problem, copies) if len(copies) else None
 
 
 def check_normals(

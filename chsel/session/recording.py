@@ -23,7 +23,8 @@ from chsel.events import (
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray, digest
 from chsel.plausible.pose_metrics import result_numbers
-from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
+from chsel.plausible.symmetry import symmetry_of
+from chsel.problem.object_symmetry import ObjectSymmetry
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
 from chsel.session.judging import trust_by
 
@@ -190,7 +191,7 @@ class SessionRecorder(Recorder):
 
 def symmetry_for_errors(start: SessionStarted) -> ObjectSymmetry | None:
     """Return the symmetries of a session's object; None if no true pose is known to need them."""
-    return None if start.world_from_object is None else object_symmetry(start.mesh)
+    return None if start.world_from_object is None else symmetry_of(start.sdf, start.mesh)
 
 
 def one_line(error: BaseException) -> str:

@@ -24,10 +24,11 @@ from chsel.events import (
 from chsel.methods.method import Method
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
-from chsel.plausible.symmetry import object_symmetry
+from chsel.plausible.symmetry import symmetry_of
 from chsel.policies.policy import Policy
 from chsel.problem.initial_sets import OnlineSettings
 from chsel.problem.points import check_contacts, check_points
+from chsel.problem.poses import Poses, inverse
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust, check_prior
 from chsel.problem.trust import check_trust
 from chsel.session.judging import FLIPPED, check_normals, noise_of, unexpected_push
@@ -79,6 +80,10 @@ class Run:
     answer: Hypotheses | None
     """The last result, with trust; None before the first."""
 
+    pose: FloatArray | None
+    """The best pose of the last result that has one, world_from_object (4, 4), where beliefs are
+    wanted: the copy by the object's symmetries that is nearest to the pose before."""
+
     trust: Trust | None
     """Trust in the last result that has a pose."""
 
@@ -126,6 +131,7 @@ class Run:
         self.registered = None
         self.problem = None
         self.answer = None
+        self.pose = None
         self.trust = None
         self.belief = None
         self.failure = ""
@@ -210,6 +216,8 @@ class Run:
         trust = self.answer.trust
         if trust is not None:
             self.trust = trust
+            if self._with_belief:
+                self.pose = self._stable(self.answer.world_from_object[0])
             self.warn(check_trust(trust, noise_of(self.method)))
             self.warn(check_prior(problem, self.answer))
             if all(earlier.code != FLIPPED for earlier in self.warnings):
@@ -217,12 +225,21 @@ class Run:
         self.belief = self.registered.belief or self.belief
         return self.answer
 
+    def _stable(self, world_from_object: FloatArray) -> FloatArray:
+        """Return the copy (4, 4) of a pose that is nearest to the pose before."""
+        if self.pose is None:
+            return world_from_object
+        symmetry = symmetry_of(self.started.sdf, self.started.mesh)
+        before = Poses.of(inverse(self.pose)[None])
+        found = Poses.of(inverse(world_from_object)[None])
+        return symmetry.nearest_copies(found, before).world_from_object[0]
+
     def _believe(self, problem: RegistrationProblem, hypotheses: Hypotheses) -> PoseBelief:
         """Return the belief after a result."""
         return PoseBelief(
             self.started.sdf,
             hypotheses,
-            symmetry=object_symmetry(self.started.mesh),
+            symmetry=symmetry_of(self.started.sdf, self.started.mesh),
             previous=self.belief,
             problem=problem,
             noise=noise_of(self.method),

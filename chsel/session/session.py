@@ -38,6 +38,7 @@ from chsel.numerics.threads import require_ieee_arithmetic
 from chsel.policies import POLICIES, build_policy
 from chsel.policies.policy import Policy
 from chsel.problem.mesh import clean_mesh, load_mesh
+from chsel.problem.object_symmetry import ObjectSymmetry
 from chsel.problem.points import (
     FREE_RESOLUTION,
     KnownPoints,
@@ -45,6 +46,7 @@ from chsel.problem.points import (
     check_workspace,
     require_parts,
 )
+from chsel.problem.pose_distances import with_symmetry
 from chsel.problem.pose_prior import PosePrior, require_prior
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.sdf_grid import COARSEST, FINEST, OBJECT_PADDING, object_grid
@@ -117,6 +119,7 @@ class Session:
         free_resolution: float = FREE_RESOLUTION,
         moves: float = 0.0,
         prior: PosePrior | None = None,
+        symmetry: ObjectSymmetry | None = None,
         seed: int = 0,
         record: str | Path | Recorder | None = None,
         live: bool = False,
@@ -129,7 +132,9 @@ class Session:
         `build_policy` gives. hand: that probes along the z axis of its frame, metres.
         workspace: where the object can be; by default it follows from the first points. moves:
         metres that a touch moves the object at most, along the hand's way. prior: what is known of
-        the pose beforehand, read by `anchored` and by trust. seed: of the random streams. record: a
+        the pose beforehand, read by `anchored` and by trust. symmetry: turns after which the object
+        counts as the same, by which errors, verdicts, modes and `pose` go; by default those that
+        map its surface to itself. seed: of the random streams. record: a
         new file .mcap or .rrd, or a recorder of one's own. live: show the session in the Rerun
         viewer.
         Raises ChselError for what cannot be used, and RecordingError if the file exists.
@@ -160,7 +165,7 @@ class Session:
         if workspace is not None:
             require_parts(workspace=workspace)
             grid = FreeGrid(workspace, free_resolution)
-        sdf = object_grid(mesh, resolution)
+        sdf = with_symmetry(object_grid(mesh, resolution), symmetry)
         require_metres(
             "noise", noise_of(method), most=MOST_NOISE * sdf.diameter, diameter=sdf.diameter
         )
@@ -237,6 +242,15 @@ class Session:
     def answer(self) -> Hypotheses | None:
         """The last result, with trust; None before the first."""
         return self._run.answer
+
+    @property
+    def pose(self) -> FloatArray | None:
+        """The best pose as a control loop takes it, world_from_object (4, 4); None before one.
+
+        Of the copies that the object's symmetries make of it, the nearest to the pose before, so
+        that it does not jump among them from step to step.
+        """
+        return self._run.pose
 
     @property
     def trust(self) -> Trust | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from chsel.belief import PoseBelief
-from chsel.plausible.symmetry import object_symmetry
+from chsel.plausible.symmetry import symmetry_of
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.session.judging import noise_of, trust_by
 from replay.comparing.choices import recorded_method
@@ -29,7 +29,7 @@ class BeliefSequence:
         self._last = PoseBelief(
             self._start.sdf,
             replace(found, trust=trust),
-            symmetry=object_symmetry(self._start.mesh),
+            symmetry=symmetry_of(self._start.sdf, self._start.mesh),
             previous=self._last,
             problem=problem,
             noise=noise_of(self._method),

@@ -22,7 +22,7 @@ from chsel.plausible.plausible_set import PlausibleSet, read_plausible
 from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.plausible.pose_metrics import closest_pose, plausible_diversity, pose_errors
 from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance, surface_points
-from chsel.plausible.symmetry import object_symmetry
+from chsel.plausible.symmetry import symmetry_of
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.settings import PRESETS, in_preset
 from chsel.problem.streams import StreamKey
@@ -236,7 +236,7 @@ def numbers_under(
     numbers["best_cost"] = float(costs[best])
     numbers["median_cost"] = float(np.median(costs))
     if start.world_from_object is not None:
-        symmetry = object_symmetry(start.mesh)
+        symmetry = symmetry_of(start.sdf, start.mesh)
         position, rotation = pose_errors(poses, start.world_from_object, symmetry=symmetry)
         closest = closest_pose(poses, start.world_from_object, sdf=start.sdf)
         for name, index in (("best", best), ("closest", closest)):

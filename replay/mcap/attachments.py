@@ -10,8 +10,9 @@ import numpy as np
 
 from chsel.errors import RecordingError
 from chsel.problem.mesh import mesh_digest
+from chsel.problem.object_symmetry import ObjectSymmetry
 from chsel.problem.sdf_grid import SdfGrid
-from replay.mcap.encoding import decode, encode
+from replay.mcap.encoding import decode, encode, shared_values
 from replay.mcap.schemas import MESH, SDF_GRID
 from replay.mcap.validation import check_digest, check_mesh
 
@@ -78,7 +79,10 @@ def mesh_attached(attachments: Mapping[str, bytes], digest: str) -> trimesh.Trim
 
 def sdf_attached(attachments: Mapping[str, bytes], digest: str) -> SdfGrid:
     """Return the SDF grid among attachments, likewise."""
-    sdf = SdfGrid(**decode("SdfGrid", _data(attachments, SDF_GRID)))
+    values = decode("SdfGrid", _data(attachments, SDF_GRID))
+    declared = values["symmetry"]
+    symmetry = None if declared is None else ObjectSymmetry(**declared)
+    sdf = SdfGrid(**{**values, "symmetry": symmetry})
     check_digest(f"attachment {SDF_GRID}", sdf.digest, recorded=digest)
     return sdf
 
@@ -91,5 +95,5 @@ def _data(attachments: Mapping[str, bytes], name: str) -> bytes:
 
 def sdf_to_bytes(sdf: SdfGrid) -> bytes:
     """Return a grid as a protobuf message; exact."""
-    fields = ("origin", "resolution", "values", "gradients")
-    return encode("SdfGrid", {name: getattr(sdf, name) for name in fields})
+    symmetry = None if sdf.symmetry is None else shared_values("Symmetry", sdf.symmetry)
+    return encode("SdfGrid", {**shared_values("SdfGrid", sdf), "symmetry": symmetry})

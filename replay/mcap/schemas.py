@@ -232,11 +232,19 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "spread": ("double", between(0.0, 1e6, unit="m")),
     },
     # No topic: this is the attachment "sdf_grid".
+    # Proper rotations about the centre, their products with those about the axis, or all rotations.
+    "Symmetry": {
+        "centre": ("f8[3]", finite),
+        "rotations": ("f8[S,3,3]", finite),
+        "axis": ("f8[3]?", finite),
+        "sphere": "bool",
+    },
     "SdfGrid": {
         "origin": "f8[3]",
         "resolution": "double",
         "values": "f8~[x,y,z]",
         "gradients": "f8~[x,y,z,3]",
+        "symmetry": "Symmetry?",  # of the object, as declared
     },
 }
 

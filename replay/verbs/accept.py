@@ -25,7 +25,8 @@ from chsel.events import (
     Timed,
 )
 from chsel.plausible.pose_metrics import pose_errors
-from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
+from chsel.plausible.symmetry import symmetry_of
+from chsel.problem.object_symmetry import ObjectSymmetry
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import Hypotheses
 from replay.comparing.beliefs import BeliefSequence
@@ -171,7 +172,7 @@ def _change(
     problem = recording.problem(found.step)
     old = _measured(found.recorded) | sets.numbers(problem, recorded)
     now = _measured(found.computed) | sets.numbers(problem, new)
-    symmetry = object_symmetry(recording.start.mesh)
+    symmetry = symmetry_of(recording.start.sdf, recording.start.mesh)
     return ResultChange(
         verdict, old, new=now, moved=best_pose_moves(recorded, new, symmetry=symmetry)
     )

@@ -18,7 +18,7 @@ from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.policies import POLICIES, policy_settings
 from chsel.problem.settings import PRESETS, in_preset, settings_mapping
-from runners.objects.loader import OBJECTS
+from runners.objects.loader import OBJECTS, ObjectConfig
 from runners.objects.scans import URL
 from runners.run.grasps import GraspConfig
 from runners.run.recording import RecordingConfig
@@ -54,8 +54,9 @@ def store_choices() -> None:
     for choice, config in OBJECTS.items():
         group, _, name = f"object/{choice}".rpartition("/")
         store(group, name, node=settings_mapping(config), package="object")
-    mesh = {"name": "mesh", "kind": "file", "scale": 1.0, "epsilon": 0.001, "scan": None}
-    store("object", "mesh", node={**mesh, "configuration": FITTED, "path": None})
+    mesh = {"name": "mesh", "kind": "file", "scale": 1.0, "epsilon": 0.001}
+    mesh |= {"configuration": FITTED}
+    store("object", "mesh", node=_defaults(ObjectConfig) | mesh)
     for name, written in (
         ("both", RecordingConfig()),
         ("mcap", RecordingConfig(rerun=False)),

@@ -18,7 +18,7 @@ from chsel.numerics.arrays import FloatArray, frozen, read_npz
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import PlausibleSet, load_plausible
 from chsel.plausible.pose_metrics import pose_errors
-from chsel.plausible.symmetry import object_symmetry
+from chsel.plausible.symmetry import symmetry_of
 from chsel.problem.poses import Poses, check_rigid, inverse
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.search_space import search_space
@@ -74,7 +74,7 @@ class ResultRows:
         self._settings = plausible_settings_of(plan, session)
         mesh, self._session = session.recorded.mesh, session
         self._metrics = HypothesisMetrics(plan.metrics, mesh, world_from_object=self._truth)
-        self._symmetry = object_symmetry(mesh)
+        self._symmetry = symmetry_of(session.recorded.sdf, mesh)
 
     @property
     def _truth(self) -> FloatArray:

@@ -11,7 +11,7 @@ import trimesh
 from chsel.belief import Gripper, PoseBelief, grasps_work, pose_offsets
 from chsel.next_probe.decision_problem import Decision, WeightedPoses
 from chsel.numerics.arrays import FloatArray
-from chsel.plausible.symmetry import object_symmetry
+from chsel.plausible.symmetry import symmetry_of
 from chsel.policies.policy import PolicySettings, StopSettings
 from chsel.problem import surface
 from chsel.problem.poses import Poses, compose, inverse, random_rotations, rotated
@@ -145,7 +145,7 @@ def belief_numbers(
     key: StreamKey,
 ) -> Row:
     """Return how far a belief is right about the true pose (4, 4), and about grasps."""
-    symmetry = object_symmetry(mesh)
+    symmetry = symmetry_of(sdf, mesh)
     truth = inverse(world_from_object)
     members = belief.object_from_world
     off = pose_offsets(symmetry, members[0], others=np.concatenate([truth[None], members]))

@@ -15,7 +15,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import require_threads
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.pose_scan import TruePoseSettings, find_true_pose
-from chsel.plausible.symmetry import object_symmetry
+from chsel.plausible.symmetry import symmetry_of
 from chsel.problem.poses import apply, compose, inverse, roll_pitch_yaw
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import CheckedSettings
@@ -89,7 +89,7 @@ def sought_pose(
     if len(problem.points.known) == 0:
         raise SessionError("there is no contact; accepted: a session that touched the object")
     found = find_true_pose(problem, guess, settings=settings)
-    symmetry = object_symmetry(mesh)
+    symmetry = symmetry_of(problem.sdf, mesh)
     pose = found.world_from_object
 
     def apart(other: FloatArray) -> dict[str, float]:

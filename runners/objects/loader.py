@@ -10,9 +10,12 @@ import numpy as np
 
 from chsel.errors import MeshWarning, SettingError, require_choice
 from chsel.problem.mesh import TESSELLATION, load_mesh
+from chsel.problem.object_symmetry import ObjectSymmetry
 from chsel.problem.points import Workspace
+from chsel.problem.pose_distances import with_symmetry
 from chsel.problem.sdf_grid import SdfGrid, object_grid
 from chsel.problem.settings import CheckedSettings, one_of, positive
+from runners.objects.model_info import read_symmetry
 from runners.objects.scans import SCANS, scan_file
 
 if TYPE_CHECKING:
@@ -32,6 +35,9 @@ class ObjectConfig(CheckedSettings):
     path: str | None = None  # the mesh, for "file"
     scan: str | None = None  # official folder name, for "scan"
     tessellation: Annotated[float, positive] = TESSELLATION  # of STEP files, see load_mesh, metres
+    symmetry: str | None = None
+    """Turns after which it counts as the same: "none", or a JSON file as models_info.json of BOP
+    datasets; None: those that map its surface to itself."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -95,6 +101,7 @@ class ObjectModel:
     epsilon: float  # tolerance of the plausible set, metres
     configuration: str  # by which simulated sources place and probe it, unless settings name one
     of_paper: bool = False  # one of the paper's simulated trials, at its scale there
+    symmetry: ObjectSymmetry | None = None  # as declared; None: that of its surface
     _grids: dict[tuple[float | None, float], SdfGrid] = field(default_factory=dict, repr=False)
 
     def resolution(self, settings: GridSettings) -> float | None:
@@ -112,7 +119,7 @@ class ObjectModel:
         padding = settings.object_padding
         if (resolution, padding) not in self._grids:
             grid = object_grid(self.mesh, resolution, padding=padding)
-            self._grids[resolution, padding] = grid
+            self._grids[resolution, padding] = with_symmetry(grid, self.symmetry)
         return self._grids[resolution, padding]
 
     @property
@@ -140,7 +147,18 @@ def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:
         epsilon=config.epsilon,
         configuration=config.configuration,
         of_paper=_of_paper(config),
+        symmetry=_symmetry(config),
     )
+
+
+def _symmetry(config: ObjectConfig) -> ObjectSymmetry | None:
+    """Return the symmetries that settings declare. Raise SettingError for a file that has none."""
+    if config.symmetry is None:
+        return None
+    if config.symmetry == "none":
+        return ObjectSymmetry()
+    path = Path(config.symmetry).expanduser()
+    return read_symmetry(path, mesh=config.path or config.name, scale=config.scale)
 
 
 def _of_paper(config: ObjectConfig) -> bool:

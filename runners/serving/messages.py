@@ -16,6 +16,7 @@ import numpy as np
 from chsel.errors import PointsError, SettingError, quoted, require_choice
 from chsel.next_probe.decision_problem import Actions
 from chsel.problem.mesh import clean_mesh, load_mesh
+from chsel.problem.object_symmetry import symmetry_from_settings
 from chsel.problem.points import FREE_RESOLUTION, POINT_CLASSES, Workspace
 from chsel.problem.pose_prior import prior_from_settings
 from chsel.problem.poses import inverse
@@ -49,6 +50,7 @@ class OpenRequest(CheckedSettings):
     seed: Annotated[int, not_negative] = 0
     record: str | None = None
     prior: Any = None
+    symmetry: Any = None
 
 
 def parsed(body: bytes) -> Json:
@@ -76,6 +78,7 @@ def open_session(body: bytes, folder: Path) -> tuple[Session, Json]:
             raise SettingError(f"record is {quoted(request.record)}; {accepted}")
         arguments["record"] = str(folder.resolve() / request.record)
     arguments["prior"] = prior_from_settings("prior", request.prior)
+    arguments["symmetry"] = symmetry_from_settings("symmetry", request.symmetry)
     session = Session(**arguments)
     return session, {"object": session.started.object, "record": arguments["record"]}
 
@@ -96,6 +99,7 @@ def register(session: Session, values: Json) -> Json:
     trust = hypotheses.trust
     return {
         "step": session.step,
+        "pose": session.pose,
         "world_from_object": inverse(hypotheses.object_from_world),
         "object_from_world": hypotheses.object_from_world,
         "cost": hypotheses.cost,

@@ -8,6 +8,7 @@ import pytest
 
 from chsel.errors import SessionError
 from chsel.problem.poses import apply, inverse
+from replay.__main__ import main
 from replay.mcap.reader import read_recording
 from replay.verbs.export import exported_bop, write_export
 from runners import bop, probe
@@ -48,12 +49,17 @@ def test_a_session_comes_back_from_the_results_file_as_it_was(dataset, tmp_path)
         "object=mesh",
         f"object.path={model}",
         "object.scale=0.001",
+        f"object.symmetry={dataset / 'models' / 'models_info.json'}",
         "method=anchored",
         "recording=mcap",
         f"logs={tmp_path}",
     )
     assert done.returncode == 0, done.stdout + done.stderr
     (path,) = tmp_path.glob("probe/*/recording.mcap")
+    assert main(["verify", str(path)]) == 0
+    symmetry = read_recording(path).start.sdf.symmetry
+    assert len(symmetry.rotations) == 4
+    np.testing.assert_allclose(symmetry.centre, 0.0, atol=1e-6)
     out = tmp_path / "results.csv"
     write_export(exported_bop(read_recording(path), None), out, file_format="csv")
     table = pd.read_csv(out)

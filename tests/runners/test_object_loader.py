@@ -1,7 +1,9 @@
 """The choice of an object leads to its mesh, or to a clear error."""
 
+import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import trimesh
 from hydra import compose, initialize_config_dir
@@ -14,6 +16,7 @@ from runners.command.choices import CONF
 from runners.command.program import plain
 from runners.objects.loader import ObjectConfig, ObjectModel, check_size, load_object
 from runners.sessions import session_settings
+from tests.chsel.samples import REPOSITORY
 from tests.runners.in_process import run
 
 # name: (simulated scale, epsilon in metres, default configuration), as the paper's trials have it
@@ -111,6 +114,59 @@ def test_scans_of_the_trials_have_their_grid_and_other_scans_do_not(ycb_director
 def test_a_choice_that_cannot_be_is_named(overrides, message, tmp_path):
     with pytest.raises(SettingError, match=message):
         load_object(chosen(*overrides.split()), tmp_path)
+
+
+def test_the_tessellation_of_a_step_file_is_a_setting(tmp_path):
+    path = REPOSITORY / "tests" / "chsel" / "problem" / "cylinder_inch.step"
+    given = f"object=mesh object.path={path} object.tessellation="
+    fine, coarse = (
+        load_object(chosen(*f"{given}{size}".split()), tmp_path).mesh for size in (1e-5, 2e-3)
+    )
+    assert len(fine.faces) > 3 * len(coarse.faces)
+
+
+def symmetry_file(folder, **values):
+    path = folder / "models_info.json"
+    path.write_text(json.dumps(values))
+    return path
+
+
+def declared(mesh, path, folder):
+    trimesh.creation.box((30.0, 50.0, 40.0)).export(folder / mesh)
+    given = f"object=mesh object.path={folder / mesh} object.scale=0.001 object.symmetry={path}"
+    return load_object(chosen(*given.split()), folder).symmetry
+
+
+def test_symmetries_are_those_of_the_file_in_the_unit_of_the_mesh(tmp_path):
+    turn = [-1, 0, 0, 20, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]  # about x = 10 mm
+    five = {"symmetries_discrete": [turn]}
+    six = {"symmetries_continuous": [{"axis": [0, 0, 2], "offset": [0, 7, 0]}]}
+    path = symmetry_file(tmp_path, **{"5": five, "6": six, "7": {"diameter": 3}})
+    found = declared("obj_000005.ply", path, tmp_path)
+    assert len(found.rotations) == 2
+    np.testing.assert_allclose(found.centre, [0.01, 0.0, 0.0], atol=1e-12)
+    found = declared("obj_000006.ply", path, tmp_path)
+    np.testing.assert_allclose(found.axis, [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(found.centre, [0.0, 0.007, 0.0], atol=1e-12)
+    assert len(declared("obj_000007.ply", path, tmp_path).rotations) == 1
+    alone = symmetry_file(tmp_path, **five)
+    assert len(declared("thing.ply", alone, tmp_path).rotations) == 2
+    assert len(declared("thing.ply", "none", tmp_path).rotations) == 1
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"5": {}}, "of the objects 5 none is that of the mesh thing.ply"),
+        ({"symmetries_discrete": [[1, 2]]}, "symmetries that are not read"),
+        ({"symmetries_discrete": [[2, *[0] * 15]]}, "turns"),
+        (None, "No such file"),
+    ],
+)
+def test_a_file_without_the_symmetries_of_a_mesh_is_one_line(values, message, tmp_path):
+    path = tmp_path / "none.json" if values is None else symmetry_file(tmp_path, **values)
+    with pytest.raises(SettingError, match=rf"symmetry .*json: .*{message}.*accepted: none, or"):
+        declared("thing.ply", path, tmp_path)
 
 
 @pytest.mark.parametrize(

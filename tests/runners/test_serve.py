@@ -127,6 +127,20 @@ def test_normals_are_recorded_as_those_of_the_library(server):
     np.testing.assert_array_equal(points.normal_noise, [0.1, 0.0, 0.3, 0.2])
 
 
+def test_a_symmetry_is_that_of_the_library(server):
+    address, folder = server
+    half = np.diag([-1.0, -1.0, 1.0, 1.0])
+    path = opened(address, record="symmetry.mcap", symmetry={"turns": [half.tolist()]})
+    ask(address, f"{path}/add", contacts=ON_BOX)
+    status, found = ask(address, f"{path}/register", body=b"")
+    assert status == 200
+    assert found["pose"] == found["world_from_object"][0]
+    ask(address, f"{path}/close", body=b"")
+    recorded = read_recording(folder / "symmetry.mcap").start.sdf.symmetry
+    np.testing.assert_allclose(recorded.rotations, [np.eye(3), half[:3, :3]], atol=1e-12)
+    assert ask(address, "/sessions", target=TARGET, symmetry="all")[0] == 400
+
+
 def test_a_prior_is_that_of_the_library(server):
     address, folder = server
     prior = {"centre": [0.0, 0.01, 0.0], "centre_noise": 0.02}

@@ -43,6 +43,11 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
         found = Search(problem, self.settings, observer=NullObserver()).minima()
         return found.poses[basin_bests(problem.sdf, found.poses, most=_MOST_RIVALS)]
 
+    def fitted(self, problem: RegistrationProblem, poses: Poses) -> Poses:
+        """Return poses fitted to the points where that lowers their energy, the likeliest first."""
+        search = Search(problem, self.settings, observer=NullObserver())
+        return search.refined(search.rated(poses)).poses
+
     def holds(  # noqa: PLR0917
         self, problem: RegistrationProblem, hypotheses: Hypotheses, object_from_world: FloatArray
     ) -> BoolArray:

@@ -10,6 +10,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.basins import MODE_DISTANCE, basin_bests
 from chsel.problem.noise import noise_model
 from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.pose_distances import SYMMETRIC
 from chsel.problem.poses import Poses, compose, random_rotations, rotated
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
@@ -39,10 +40,22 @@ def near_symmetries(sdf: SdfGrid) -> FloatArray:
 
 
 def _near_symmetries(sdf: SdfGrid) -> FloatArray:
-    if not has_surface(sdf):
-        return np.zeros((0, 4, 4))
-    centre = object_centre(sdf)
+    fits = _fits_to_itself(sdf, _ALIKE)
+    if len(fits) == 0:
+        return fits.matrices
+    poses = Poses.joined([Poses.of(np.eye(4)[None]), fits])
+    return poses[basin_bests(sdf, poses, most=_MOST + 1, distance=np.inf)[1:]].matrices
+
+
+def _fits_to_itself(sdf: SdfGrid, most: float) -> Poses:
+    """Return fits of the object to itself, the best first.
+
+    most: diameters that they move the surface by, root mean square.
+    """
     identity = Poses.of(np.eye(4)[None])
+    if not has_surface(sdf):
+        return identity[:0]
+    centre = object_centre(sdf)
     energy = energy_in_itself(sdf, MODE_DISTANCE)
     turns = random_rotations(StreamKey(0, 0).stream(Purpose.MESH_SAMPLES, 1), _TURNS)
     turned = turned_about(centre, turns)
@@ -50,9 +63,16 @@ def _near_symmetries(sdf: SdfGrid) -> FloatArray:
     fits = fitted(energy, twists_of(SE3Space(), centre), poses=turned[best], steps=_STEPS)
     distances = outline_distances_to(sdf, fits, other=identity)
     order = np.argsort(distances, kind="stable")
-    order = order[distances[order] <= _ALIKE * sdf.diameter]
-    poses = Poses.joined([identity, fits[order]])
-    return poses[basin_bests(sdf, poses, most=_MOST + 1, distance=np.inf)[1:]].matrices
+    return fits[order[distances[order] <= most * sdf.diameter]]
+
+
+def turns_alike(sdf: SdfGrid) -> FloatArray:
+    """Return motions (S, 4, 4) that map the object's surface to itself, at most 100.
+
+    They move it by at most SYMMETRIC diameters, root mean square. Those about an axis of revolution
+    are spread around it.
+    """
+    return sdf.derived("turns alike", lambda: _fits_to_itself(sdf, SYMMETRIC).matrices)
 
 
 def energy_in_itself(sdf: SdfGrid, noise: float) -> Energy:

@@ -7,11 +7,11 @@ import numpy as np
 from chsel.methods.anchored.fitting import fitted, twists_of
 from chsel.methods.anchored.near_symmetries import energy_in_itself, turned_about
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.pose_distances import SYMMETRIC, middle
 from chsel.problem.poses import Poses, product, rotated, rotation_angle
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SE3Space
 from chsel.problem.surface import has_surface, outline_distances_to
-from chsel.problem.trust import SYMMETRIC, middle
 
 # Where these numbers are from: docs/anchored.md, "Numbers that are no settings".
 _SOFT = 0.02  # diameters: noise of the fit of an object to itself
@@ -25,15 +25,18 @@ def pose_bound(sdf: SdfGrid, poses: Poses) -> tuple[float, float]:
 
     In metres: the object's centre. In radians: the turn that is left after the nearest symmetry of
     the object, a motion that moves the surface by at most SYMMETRIC diameters, root mean square. It
-    is found by fitting the object, turned, to itself.
+    is found by fitting the object, turned, to itself. Declared symmetries count as they are.
     """
     if not has_surface(sdf):
         return 0.0, 0.0
-    centre = middle(sdf)
+    symmetry = sdf.symmetry
+    centre = middle(sdf) if symmetry is None else symmetry.centre
     back = np.swapaxes(poses.rotations, 1, 2)  # world_from_object
     places = rotated(back, centre - poses.translations)
     away = np.sqrt(((places - places[0]) ** 2).sum(axis=1))
     turns = product(poses.rotations[0], back)  # of the object, in its frame
+    if symmetry is not None:
+        return float(away.max()), float(symmetry.rotation_errors(turns).max())
     angles = rotation_angle(turns)
     order = np.argsort(-angles, kind="stable")
     large = order[angles[order] > _SMALL]
