@@ -42,6 +42,8 @@ from .sensing.free_space import poses_between as poses_between
 from .sensing.lens import LensDistortion as LensDistortion
 from .sensing.touch_image import TouchPoints as TouchPoints
 from .sensing.touch_image import touch_points as touch_points
+from .sensing.trajectory import Trajectory as Trajectory
+from .sensing.trajectory import read_trajectory as read_trajectory
 from .session.judging import trust_by as trust_by
 from .session.loop import Loop as Loop
 from .session.session import NextProbe as NextProbe

@@ -309,9 +309,7 @@ def perceived(
         poses = frozen("path", path, shape=(None, 4, 4), error=PoseError, most=FARTHEST_PLACE)
         poses = nearest_rigid("path", poses)
         require_instance("hand", hand, kind=trimesh.Trimesh, accepted=_HAND)
-        vertices, faces = np.array(hand.vertices, np.float64), np.array(hand.faces, np.int64)
-        nodes, radius = _inside_of_hand(vertices.tobytes(), faces.tobytes(), spacing=spacing)
-        swept = poses_between(poses, step=0.5 * spacing, radius=radius)
+        nodes, swept = swept_by(hand, poses, spacing=spacing)
     look = None
     seen = KnownPoints()
     side = diameter / _ACROSS
@@ -358,6 +356,19 @@ def _seen_points(look: DepthLook, normal_noise: Any) -> KnownPoints:
     return KnownPoints(
         known=look.surface, normals=look.normals, normal_noise=np.where(known, noise, 0.0)
     )
+
+
+def swept_by(
+    hand: trimesh.Trimesh, path: FloatArray, *, spacing: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return points (M, 3) inside a hand, and so many poses (P, 4, 4) that these sweep its way.
+
+    path (K, 4, 4): the poses world_from_hand that it went through. spacing: side of free voxels,
+    metres. Raise MeshError for a hand without an inside.
+    """
+    vertices, faces = np.array(hand.vertices, np.float64), np.array(hand.faces, np.int64)
+    nodes, radius = _inside_of_hand(vertices.tobytes(), faces.tobytes(), spacing=spacing)
+    return nodes, poses_between(path, step=0.5 * spacing, radius=radius)
 
 
 @lru_cache(maxsize=4)  # as most paths are of one hand

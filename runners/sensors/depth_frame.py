@@ -23,6 +23,7 @@ from chsel.sensing.depth_camera import (
 )
 from chsel.sensing.free_space import FreeGrid
 from chsel.sensing.lens import LensDistortion
+from runners.sensors.calibration_file import read_calibration
 from runners.sensors.depth_camera import View, edge_pixels, mark_rays, metres
 from runners.sensors.log.images import read_image
 from runners.sensors.pose_file import pose_of_rows, read_yaml
@@ -49,7 +50,8 @@ class FrameFile(CheckedSettings):
     """The keys of the YAML; paths in it are relative to it."""
 
     depth: str  # .png or .tiff of integers, .tiff or .npy of floating point
-    intrinsics: Intrinsics
+    intrinsics: Intrinsics | None = None
+    calibration: str | None = None  # file of OpenCV or ROS, in place of intrinsics and distortion
     depth_scale: Annotated[float | None, positive] = None
     """Metres a unit; null: 0.001 for integers, 1 for floating point."""
 
@@ -68,6 +70,10 @@ class FrameFile(CheckedSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if (self.intrinsics is None) is (self.calibration is None):
+            raise SessionError("accepted: intrinsics, or calibration, a file of OpenCV or ROS")
+        if self.calibration is not None and self.distortion:
+            raise SessionError("calibration and distortion; accepted: one of them")
         if self.object_class is not None and self.label is None:
             raise SessionError("object_class without label; accepted: both, or label alone")
 
@@ -99,10 +105,17 @@ def read_depth_frame(path: str | Path) -> DepthFrame:
 def _frame(file: FrameFile, folder: Path) -> DepthFrame:
     depth = _depth(file, folder)
     height, width = depth.shape
-    pinhole = PinholeCamera(width=width, height=height, **asdict(file.intrinsics))
+    lens = None
+    if file.calibration is not None:
+        path = folder / Path(file.calibration).expanduser()
+        pinhole, lens = read_calibration(path, width=width, height=height)
+    else:
+        assert file.intrinsics is not None
+        pinhole = PinholeCamera(width=width, height=height, **asdict(file.intrinsics))
+        if any(file.distortion):
+            lens = LensDistortion(file.distortion_model, file.distortion)
     label = None if file.label is None else _label(file, folder, shape=depth.shape)
-    if any(file.distortion):
-        lens = LensDistortion(file.distortion_model, file.distortion)
+    if lens is not None:
         depth = lens.undistorted(depth, pinhole)
         label = None if label is None else lens.undistorted_mask(label, pinhole)
     camera, truth = file.world_from_camera, file.world_from_object

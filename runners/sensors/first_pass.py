@@ -17,6 +17,7 @@ from runners.sensors.log.messages import Received, TransformMessage
 from runners.sensors.log.motion import MotionLimits
 from runners.sensors.log.probe_windows import ProbeWindow, marked_windows, timed_windows, whole_log
 from runners.sensors.log.raw_log import RawLog
+from runners.sensors.log.trajectory_files import trajectory_messages
 from runners.sensors.log.transforms import JointHistory, TransformError, TransformTree
 from runners.sensors.rig import Rig
 from runners.sensors.session_report import LogWarnings
@@ -107,6 +108,9 @@ class FirstPass:
         for received in log.messages(_topics(log, rig, sensors=sensors)):
             clocks.add(received)
             self._take(received)
+        for trajectory in rig.trajectories:
+            for received in trajectory_messages(trajectory, self.folder):
+                self._take(received)
         self.clocks = clocks.correction()
         self.tree.settle(self.clocks)
         limits = MotionLimits(rig.max_speed, rig.max_turn)

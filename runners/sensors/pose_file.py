@@ -23,10 +23,18 @@ _ACCEPTED = (
 )
 
 
+_OF_OPENCV = b"%YAML:1.0"  # first line of cv::FileStorage before OpenCV 5, which no YAML has
+
+
 class _Loader(yaml.SafeLoader):
     """Reads 1e-3 as a number, as YAML 1.2 and the files of Hydra do; YAML 1.1 asks for 1.0e-3."""
 
 
+# cv::FileStorage names the types of its matrices; they are mappings.
+_Loader.add_constructor(
+    "tag:yaml.org,2002:opencv-matrix",
+    lambda loader, node: loader.construct_mapping(node, deep=True),
+)
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
     re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"),
@@ -38,7 +46,10 @@ def read_yaml(path: Path) -> dict[Any, Any]:
     """Return the mapping in a file. Raise SessionError, its text without the file's name."""
     refuse_special_file("it", path, error=SessionError)
     try:
-        values = yaml.load(path.read_bytes(), _Loader)
+        text = path.read_bytes()
+        if text.startswith(_OF_OPENCV):
+            text = text.partition(b"\n")[2]
+        values = yaml.load(text, _Loader)
     except OSError as error:
         raise SessionError(f"cannot be read ({error.strerror or error})") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:

@@ -10,6 +10,7 @@ from runners.sensors.hand import HAND, HandModel
 from runners.sensors.pad import Pad
 from runners.sensors.rig import Rig
 from runners.sensors.sensor import Sensor
+from runners.sensors.touch import TouchSensor
 
 
 def sensors_of(rig: Rig, hand: HandModel | None) -> list[Sensor]:
@@ -20,6 +21,7 @@ def sensors_of(rig: Rig, hand: HandModel | None) -> list[Sensor]:
     sensors: list[Sensor] = [
         *(DepthCamera(camera) for camera in rig.cameras),
         *(Pad(pad, rig.contact) for pad in rig.bubbles),
+        *(TouchSensor(touch, rig.surface_resolution) for touch in rig.touches),
         *(Cloud(cloud, rig.surface_resolution) for cloud in rig.clouds),
         *(ForceSensor(force, rig.surface_resolution, hand=hand) for force in rig.forces),
     ]

@@ -11,6 +11,7 @@ from chsel.numerics.arrays import frozen
 from chsel.problem.points import Workspace
 from chsel.problem.pose_prior import prior_from_settings
 from chsel.problem.settings import Check, CheckedSettings, not_negative, one_of, positive
+from chsel.sensing.trajectory import TRAJECTORIES
 
 NO_NORMALS = "none"  # setting of a sensor whose normals are not used
 _HALF_TURN = 180.0  # degrees
@@ -141,6 +142,45 @@ class HandRig:
     urdf: str | None = None  # file whose links' collision shapes belong to the hand
     root: str | None = None  # the link of the urdf that is `frame`; null: its base
     joints: str | None = None  # topic of the joints that pose the links
+
+
+@dataclass(frozen=True)
+class TouchRig(CheckedSettings):
+    """A sensor that looks at a gel from behind, such as GelSight and DIGIT, and sends heights."""
+
+    name: Name
+    height: str  # topic of images of how far the gel is pressed in
+    pixel: Annotated[float, positive]  # metres from one to the next
+    frame: str | None = None
+    """Of the middle of the image on the untouched gel, x along columns, y along rows, z out of the
+    gel; null: that of the messages."""
+
+    unit: Annotated[float | None, positive] = None
+    """Metres a unit of the image; null: 1, for floating point alone."""
+
+    threshold: Annotated[float, positive] = 0.0001  # metres: pixels pressed in by more touch
+    normals: Degrees = NO_NORMALS
+    """Root mean square angle by which normals are off, degrees; none: they are not used."""
+
+
+@dataclass(frozen=True)
+class TrajectoryRig(CheckedSettings):
+    """A file of poses of a frame, as of motion capture, beside the transforms of the log."""
+
+    file: str  # relative to the folder of the log
+    kind: Annotated[str, one_of(*TRAJECTORIES)]
+    parent: str  # frame in which the poses are
+    child: str  # frame that was followed
+    offset: float = 0.0  # seconds to be added to its times, for those of the log's stamps
+    times: str | None = None  # file of a time a row, seconds, for kitti
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.kind == "kitti") is not (self.times is not None):
+            raise SettingError(
+                f"times is {self.times}, and kind {self.kind}; accepted: times=FILE for kitti, "
+                "whose rows have none, and null for others"
+            )
 
 
 @dataclass(frozen=True)
@@ -279,6 +319,8 @@ class Rig(CheckedSettings):
     bubbles: tuple[BubbleRig, ...] = ()
     contact: ContactRig = field(default_factory=ContactRig)
     hand: HandRig | None = None
+    touches: tuple[TouchRig, ...] = ()
+    trajectories: tuple[TrajectoryRig, ...] = ()
     clouds: tuple[CloudRig, ...] = ()
     forces: tuple[ForceRig, ...] = ()
     markers: str | None = None

@@ -25,6 +25,7 @@ from chsel.errors import (
 )
 from chsel.events import Probe, Start
 from chsel.numerics.arrays import FloatArray, IntArray, frozen, read_npz, refuse_special_file
+from chsel.problem.mesh import load_mesh
 from chsel.problem.points import (
     FREE_RESOLUTION,
     NEAR_UNIT,
@@ -45,8 +46,12 @@ from chsel.problem.pose_prior import prior_from_settings
 from chsel.problem.poses import nearest_rigid
 from chsel.problem.sdf_grid import OBJECT_PADDING
 from chsel.problem.streams import LAST_STEP
+from chsel.sensing.free_space import FreeGrid
+from chsel.sensing.trajectory import TRAJECTORIES, read_trajectory
+from chsel.session.perception import swept_by
 from runners.objects.loader import ObjectModel
 from runners.sessions.source import ObjectOrigin, ProbeSource, SourceKind
+from runners.sessions.touch_arrays import TOUCH_ARRAYS, touched_in
 
 NORMALS = ("none", "file")
 
@@ -73,6 +78,10 @@ class PointsSettings:
     """NORMALS: "file" reads the normals of the file, "none" leaves them out."""
     normal_noise: float = NORMAL_NOISE
     """Root mean square angle by which they are off where the file does not say, radians."""
+    trajectory: str | None = None
+    """A file of the poses that the hand went through, whose way is free from the first step on."""
+    trajectory_kind: str | None = None  # of chsel.sensing.trajectory.TRAJECTORIES
+    hand: str | None = None  # its mesh, in its own frame, metres
 
     def __post_init__(self) -> None:
         require_choice("normals", self.normals, accepted=NORMALS)
@@ -88,6 +97,12 @@ class PointsSettings:
                 f"workspace is {self.workspace}; accepted: [[x0, x1], [y0, y1], [z0, z1]]"
             )
         prior_from_settings("prior", self.prior)
+        of_hand = [self.trajectory, self.trajectory_kind, self.hand]
+        if None in of_hand and of_hand != [None] * 3:
+            raise SettingError(
+                f"trajectory, trajectory_kind and hand are {of_hand}; accepted: all of them, with "
+                f"a kind of {', '.join(TRAJECTORIES)}, or none"
+            )
 
 
 class PointsSource(ProbeSource):
@@ -135,6 +150,7 @@ class PointsSource(ProbeSource):
             "the nearest point", every.all_points(), diameter=diameter, workspace=given
         )
         self.workspace = given or workspace_around(every, object_model.grid(settings))
+        self._points[0] = self._points[0].merged(KnownPoints(free=self._swept(settings)))
 
     def probes(self) -> Iterator[Probe]:
         """Yield one probe per step of the file."""
@@ -148,6 +164,21 @@ class PointsSource(ProbeSource):
                 contacts=found.known,
                 contact_normals=found.normals,
             )
+
+    def _swept(self, settings: PointsSettings) -> FloatArray:
+        """Return the centres (F, 3) of the voxels that the hand went through, world, metres."""
+        if settings.trajectory is None or settings.hand is None:
+            return np.zeros((0, 3))
+        _, poses = read_trajectory(settings.trajectory, settings.trajectory_kind or "")
+        hand = load_mesh(settings.hand)
+        nodes, swept = swept_by(hand, poses, spacing=self.free_resolution)
+        grid = FreeGrid(self.workspace, self.free_resolution)
+        grid.at(nodes, poses=swept)
+        free = grid.new()
+        if len(free) == 0:
+            text = f"trajectory {settings.trajectory} misses the workspace around the points"
+            self.warnings.append(PointsWarning("trajectory", f"{text}; check its frame and unit"))
+        return free
 
     def close(self) -> None:
         """Release nothing, as nothing is held open."""
@@ -241,11 +272,13 @@ def read_points(path: str | Path, *, normal_noise: float | None = None) -> Point
 def _read_npz(path: Path, normal_noise: float | None) -> PointFile:
     of_normals = [f"{kind}_{name}" for kind in _WITH_NORMALS for name in _OF_NORMALS]
     accepted = [*KINDS, "known_sdf", *(f"{kind}_step" for kind in KINDS), "world_from_object"]
-    accepted += of_normals
+    accepted += [*of_normals, *TOUCH_ARRAYS]
     arrays = read_npz(path, accepted=accepted, error=PointsError)
     given = [kind for kind in KINDS if kind in arrays]
-    if not given:
-        raise PointsError(f"no array of points; accepted: at least one of {', '.join(KINDS)}")
+    has_touches = any(name in arrays for name in TOUCH_ARRAYS)
+    if not given and not has_touches:
+        names = f"{', '.join(KINDS)}, {TOUCH_ARRAYS[0]}"
+        raise PointsError(f"no array of points; accepted: at least one of {names}")
     if ("known" in arrays) != ("known_sdf" in arrays):
         raise PointsError("known and known_sdf stand only together")
     pose = arrays.get("world_from_object")
@@ -256,6 +289,8 @@ def _read_npz(path: Path, normal_noise: float | None) -> PointFile:
         if f"{kind}_{name}" in arrays and kind not in given:
             raise PointsError(f"{kind}_{name} has no {kind}; accepted: both, or none")
     parts = [_npz_part(kind, arrays, normal_noise=normal_noise) for kind in given]
+    if has_touches:
+        parts.append(_touch_part(arrays, normal_noise=normal_noise))
     columns = (np.concatenate(column) for column in zip(*parts, strict=True))
     kinds, points, sdf, steps, normals, noise = columns
     return PointFile(
@@ -265,9 +300,20 @@ def _read_npz(path: Path, normal_noise: float | None) -> PointFile:
         steps=steps,
         normals=normals,
         normal_noise=noise,
-        has_unread_normals=normal_noise is None and any(name in arrays for name in of_normals),
+        has_unread_normals=normal_noise is None
+        and (has_touches or any(name in arrays for name in of_normals)),
         world_from_object=pose,
     )
+
+
+def _touch_part(arrays: dict[str, Any], *, normal_noise: float | None) -> tuple[np.ndarray, ...]:
+    """Return kinds, points, distances, steps, normals and their noise of touch images."""
+    points, normals, steps = touched_in(arrays)
+    known = normals.any(axis=1)
+    if normal_noise is None:
+        normals, known = np.zeros_like(normals), np.zeros_like(known)
+    noise = np.where(known, normal_noise or 0.0, 0.0)
+    return np.full(len(points), "surface"), points, np.zeros(len(points)), steps, normals, noise
 
 
 def _npz_part(

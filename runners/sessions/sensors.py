@@ -11,7 +11,7 @@ import numpy as np
 
 from chsel.errors import SettingError
 from chsel.events import Logged, Probe, RigDescribed, Start
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray, digest
 from chsel.problem.points import KnownPoints, check_points
 from chsel.problem.pose_prior import PosePrior, prior_from_settings
 from chsel.problem.settings import CheckedSettings, not_negative, positive
@@ -31,6 +31,7 @@ from runners.sensors.hand import HandModel, HandPath
 from runners.sensors.log.clocks import in_time_order
 from runners.sensors.log.messages import Received
 from runners.sensors.log.raw_log import RawLog
+from runners.sensors.log.trajectory_files import trajectory_files
 from runners.sensors.pose_file import beside, read_pose
 from runners.sensors.registry import sensors_of
 from runners.sensors.rig import Rig
@@ -160,7 +161,11 @@ class SensorsSource(ProbeSource):
             seed=seed,
             images=settings.images,
         )
+        beside_log = trajectory_files(rig.trajectories, self._first_pass.folder)
         self._digest = self._log.digest()
+        if beside_log:
+            digests = [self._digest, *(file_digest(file) for file in beside_log)]
+            self._digest = digest(np.frombuffer("".join(digests).encode(), dtype=np.uint8))
         self.count = len(self._first_pass.windows)
         if rig.boundary == "box_shell":
             free.grid.at(box_shell(free.grid.lattice, self.workspace))

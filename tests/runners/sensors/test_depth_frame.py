@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -84,6 +85,46 @@ def test_the_lens_of_a_frame_is_undone_in_depth_and_label(tmp_path):
     assert frame.depth[frame.label].max() < FRONT + 1e-9
     with pytest.raises(SessionError, match=r"frame\.yaml: distortion plumb_bob has coefficients"):
         read_depth_frame(written(tmp_path, distortion=[0.1]))
+
+
+@pytest.mark.parametrize("name", ["opencv_4", "opencv_5", "ros"])
+def test_a_calibration_is_that_of_the_numbers_in_it(name, tmp_path):
+    """Files by cv::FileStorage of OpenCV 4.12 and 5.0, and by ROS 1's camera_calibration_parsers.
+
+    They have the INTRINSICS and the barrel of the test above.
+    """
+    calibration = str(Path(__file__).parent / "calibration" / f"{name}.yaml")
+    found = read_depth_frame(written(tmp_path, intrinsics=None, calibration=calibration))
+    stated = read_depth_frame(written(tmp_path, distortion=[-1.2, 0.05, 0.0, 0.0, 0.0]))
+    assert found.camera == stated.camera
+    np.testing.assert_array_equal(found.depth, stated.depth)
+    np.testing.assert_array_equal(found.label, stated.label)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (("image_width: 80", "image_width: 640"), "image_width is 640, and that of the image 80"),
+        (("camera_matrix:", "M1:"), "no camera_matrix; it has image_width, image_height"),
+        (("0.050000000000000003, 0, ", ""), "distortion plumb_bob has coefficients"),
+        (("plumb_bob", "warped"), "distortion model is 'warped'"),
+        (("[100, 0,", "[100,"), "camera_matrix has 8 numbers"),
+    ],
+)
+def test_a_calibration_that_is_of_another_camera_or_form_is_one_line(changed, message, tmp_path):
+    text = (Path(__file__).parent / "calibration" / "ros.yaml").read_text()
+    (tmp_path / "camera.yaml").write_text(text.replace(*changed))
+    with pytest.raises(SessionError, match=rf"calibration .*camera\.yaml: {message}"):
+        read_depth_frame(written(tmp_path, intrinsics=None, calibration="camera.yaml"))
+
+
+def test_a_frame_has_intrinsics_or_a_calibration(tmp_path):
+    for changes in ({"intrinsics": None}, {"calibration": "camera.yaml"}):
+        with pytest.raises(SessionError, match="accepted: intrinsics, or calibration"):
+            read_depth_frame(written(tmp_path, **changes))
+    twice = {"intrinsics": None, "calibration": "camera.yaml", "distortion": [0.1] * 5}
+    with pytest.raises(SessionError, match="calibration and distortion; accepted: one"):
+        read_depth_frame(written(tmp_path, **twice))
 
 
 def test_a_frame_is_read_with_all_its_parts(tmp_path):

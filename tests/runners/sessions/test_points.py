@@ -400,3 +400,34 @@ def test_workspace_is_that_of_the_points_padded_by_the_diameter(tmp_path):
         PointsSettings()
     with pytest.raises(SettingError, match=r"\[\[x0, x1\]"):
         PointsSettings("x", workspace=((0, 1), (0, 1)))
+
+
+def test_the_way_of_a_hand_is_free_from_the_first_step_on(tmp_path):
+    """A cube of 40 mm goes along x through the workspace, 0.2 m above the points."""
+    trimesh.creation.box((0.04, 0.04, 0.04)).export(tmp_path / "hand.stl")
+    rows = [f"{n} {-0.2 + 0.1 * n} 0.1 0.2 0 0 0 1" for n in range(6)]
+    way = text(tmp_path, "\n".join(rows), name="hand.txt")
+    path = npz(tmp_path, surface=SURFACE, surface_step=np.array([1, 1, 4]))
+    settings = PointsSettings(
+        str(path),
+        trajectory=str(way),
+        trajectory_kind="tum",
+        hand=str(tmp_path / "hand.stl"),
+        workspace=((-0.1, 0.2), (-0.1, 0.3), (-0.1, 0.3)),
+    )
+    probes = list(PointsSource(settings, BOX).probes())
+    free = probes[0].new_points.free
+    assert len(probes[1].new_points.free) == 0
+    inside = (np.abs(free[:, 1:] - [0.1, 0.2]) <= 0.02 + 0.005).all(axis=1)
+    assert inside.all()
+    along = np.unique(np.round(free[:, 0], 6))
+    assert along.min() < -0.09
+    assert along.max() > 0.19
+    assert np.diff(along).max() < 0.0101
+    volume = len(free) * settings.free_resolution**3
+    assert volume == pytest.approx(0.3 * 0.04 * 0.04, rel=0.6)
+    elsewhere = text(tmp_path, "0 5 5 5 0 0 0 1\n", name="far.txt")
+    missed = PointsSource(dataclasses.replace(settings, trajectory=str(elsewhere)), BOX)
+    assert any("misses the workspace" in str(warning) for warning in missed.warnings)
+    with pytest.raises(SettingError, match="trajectory, trajectory_kind and hand are"):
+        dataclasses.replace(settings, hand=None)
