@@ -13,6 +13,7 @@ from chsel.errors import SessionError
 from chsel.numerics.arrays import IntArray
 from runners.sensors.hand import HAND, HandModel
 from runners.sensors.log.clocks import ClockCorrection, Clocks
+from runners.sensors.log.lerobot import LeRobotEpisode
 from runners.sensors.log.messages import Received, TransformMessage
 from runners.sensors.log.motion import MotionLimits
 from runners.sensors.log.probe_windows import ProbeWindow, marked_windows, timed_windows, whole_log
@@ -80,7 +81,7 @@ class FirstPass:
 
     def __init__(
         self,
-        log: RawLog,
+        log: RawLog | LeRobotEpisode,
         rig: Rig,
         *,
         sensors: Sequence[TopicReader],
@@ -242,7 +243,7 @@ class FirstPass:
         return SessionError(f"log {self._log.path}: {text}")
 
 
-def _topics(log: RawLog, rig: Rig, *, sensors: Sequence[TopicReader]) -> set[str]:
+def _topics(log: RawLog | LeRobotEpisode, rig: Rig, *, sensors: Sequence[TopicReader]) -> set[str]:
     """Return the topics to read: those that sensors, the hand and markers need, and transforms.
 
     Raise SessionError if the log lacks one of them.

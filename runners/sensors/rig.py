@@ -38,6 +38,33 @@ def _is_noise(value: Any) -> bool:
     return bool(0.0 < value <= _HALF_TURN) if number else bool(value == NO_NORMALS)
 
 
+_NEEDED = {
+    "pose": ("parent", "frame", "unit", "rotation"),
+    "joints": ("joints", "unit"),
+    "wrench": ("frame", "unit"),
+    "taxels": ("frame", "points", "threshold"),
+    "marker": (),
+}
+"""What the column of a kind has to say."""
+
+_UNITS: dict[str, tuple[str | None, ...]] = {
+    "pose": ("m", "cm", "mm"),
+    "joints": ("rad", "deg", "m"),
+    "wrench": ("N",),
+    "taxels": (None,),
+    "marker": (None,),
+}
+_ROTATIONS = {
+    "quaternion_xyzw": 4,
+    "quaternion_wxyz": 4,
+    "rotation_vector": 3,
+    "roll_pitch_yaw": 3,
+    "matrix": 9,
+}
+"""Numbers of a rotation."""
+
+_WITH_ANGLE = ("rotation_vector", "roll_pitch_yaw")
+
 Vector = tuple[float, float, float]
 Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 Name = Annotated[str, _fits("letters, digits and _", lambda name: name.replace("_", "").isalnum())]
@@ -184,6 +211,78 @@ class TrajectoryRig(CheckedSettings):
 
 
 @dataclass(frozen=True)
+class ColumnRig(CheckedSettings):
+    """A column of a LeRobot dataset, whose files say neither frames nor units.
+
+    Where another part of the rig names a topic, it names the column.
+    """
+
+    column: str
+    kind: Annotated[str, one_of(*_NEEDED)]
+    """"pose" of a frame, "joints", of which a urdf gives the pose of a link, "wrench": force and
+    torque, "taxels", or "marker": the index of a probe, below 0 outside of probes."""
+
+    select: tuple[int, ...] = ()  # which numbers of the column, in their order; none: all
+    parent: str | None = None  # frame in which a pose is, or in which the root of the urdf is
+    frame: str | None = None  # that is posed; a link; that of forces; that of taxels
+    unit: str | None = None  # of places or joints: m, cm, mm, rad or deg; of forces: N
+    rotation: str | None = None
+    """How a pose has it behind its place: quaternion_xyzw, quaternion_wxyz, rotation_vector,
+    roll_pitch_yaw, or matrix, row by row."""
+
+    angle: str | None = None  # rad or deg, of a rotation_vector or roll_pitch_yaw
+    joints: tuple[str, ...] = ()  # names of the numbers
+    urdf: str | None = None  # file, relative to the dataset
+    root: str | None = None  # link that is `parent`; null: the base of the urdf
+    points: Annotated[tuple[Vector, ...], _points] = ()  # of taxels, metres, in their frame
+    normals: Annotated[tuple[Vector, ...], _points] = ()
+    """Out of the object, as taxels touch it, in their frame; none: they are not known."""
+
+    threshold: float | None = None  # above which a taxel touches, in the unit of the column
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        needed = list(_NEEDED[self.kind])
+        if self.rotation in _WITH_ANGLE:
+            needed.append("angle")
+        if self.urdf is not None:
+            needed += ["parent", "frame"]
+        missing = [name for name in needed if not getattr(self, name) and name != "threshold"]
+        if "threshold" in needed and self.threshold is None:
+            missing.append("threshold")
+        if missing:
+            raise SettingError(
+                f"column {self.column} does not say {', '.join(missing)}, and no file of the "
+                f"dataset does; accepted: all of kind {self.kind}, {', '.join(needed)}"
+            )
+        for name, accepted in (
+            ("unit", _UNITS[self.kind]),
+            ("rotation", (None, *_ROTATIONS)),
+            ("angle", (None, "rad", "deg")),
+        ):
+            if getattr(self, name) not in accepted:
+                shown = ", ".join(str(each) for each in accepted if each is not None) or "null"
+                raise SettingError(f"{name} is {getattr(self, name)!r}; accepted: {shown}")
+        if self.normals and len(self.normals) != len(self.points):
+            raise SettingError(
+                f"normals are {len(self.normals)} and points {len(self.points)}; accepted: as many"
+            )
+        if min(self.select, default=0) < 0:
+            raise SettingError(f"select is {self.select}; accepted: indices from 0")
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Accepted numbers of values in a row."""
+        if self.kind == "pose":
+            return (3 + _ROTATIONS[self.rotation or ""],)
+        if self.kind == "joints":
+            return (len(self.joints),)
+        if self.kind == "taxels":
+            return (len(self.points),)
+        return (1,) if self.kind == "marker" else (3, 6)
+
+
+@dataclass(frozen=True)
 class CloudRig(CheckedSettings):
     """A topic of points, in the frame of its messages."""
 
@@ -321,6 +420,8 @@ class Rig(CheckedSettings):
     hand: HandRig | None = None
     touches: tuple[TouchRig, ...] = ()
     trajectories: tuple[TrajectoryRig, ...] = ()
+    columns: tuple[ColumnRig, ...] = ()  # of a LeRobot dataset, in place of a log's topics
+    episode: Annotated[int | None, not_negative] = None  # of the dataset; null: its only one
     clouds: tuple[CloudRig, ...] = ()
     forces: tuple[ForceRig, ...] = ()
     markers: str | None = None

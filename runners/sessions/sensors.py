@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from chsel.errors import SettingError
+from chsel.errors import SessionError, SettingError
 from chsel.events import Logged, Probe, RigDescribed, Start
 from chsel.numerics.arrays import FloatArray, digest
 from chsel.problem.points import KnownPoints, check_points
@@ -29,6 +29,7 @@ from runners.sensors.depth_frame import DepthFrame, depth_frame_points, read_dep
 from runners.sensors.first_pass import FirstPass
 from runners.sensors.hand import HandModel, HandPath
 from runners.sensors.log.clocks import in_time_order
+from runners.sensors.log.lerobot import INFO, LeRobotEpisode
 from runners.sensors.log.messages import Received
 from runners.sensors.log.raw_log import RawLog
 from runners.sensors.log.trajectory_files import trajectory_files
@@ -98,6 +99,18 @@ SENSORS = SourceKind(
 )
 
 
+def _opened(path: Path, rig: Rig) -> RawLog | LeRobotEpisode:
+    """Return a log, or an episode of a dataset. Raise SessionError if it cannot be used."""
+    if (path / INFO).is_file():
+        return LeRobotEpisode(path, rig.columns, episode=rig.episode)
+    if rig.columns:
+        raise SessionError(
+            f"log {path} is no LeRobot dataset, of which rig {rig.name} names columns; accepted: a "
+            f"folder with {INFO}, or a rig without columns"
+        )
+    return RawLog(path)
+
+
 class SensorsSource(ProbeSource):
     """Reads a log twice: what is small at once, images one after the other; see `ProbeSource`."""
 
@@ -124,7 +137,7 @@ class SensorsSource(ProbeSource):
         hand = HandModel(rig.hand) if rig.hand else None
         for text in hand.warnings if hand else ():
             self._lines.warn(text)
-        self._log = RawLog(path)
+        self._log = _opened(path, rig)
         self._find_pose(path, settings.pose)
         sensors = sensors_of(rig, hand)
         self._first_pass = FirstPass(

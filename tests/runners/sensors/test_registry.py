@@ -10,7 +10,15 @@ from chsel.errors import SettingError
 from runners.sensors.hand import HandModel
 from runners.sensors.log import messages
 from runners.sensors.registry import sensors_of
-from runners.sensors.rig import CloudRig, ExtraContacts, ForceRig, Rig, TouchRig, TrajectoryRig
+from runners.sensors.rig import (
+    CloudRig,
+    ColumnRig,
+    ExtraContacts,
+    ForceRig,
+    Rig,
+    TouchRig,
+    TrajectoryRig,
+)
 from runners.sensors.sensor import Sensor
 from tests.runners.sensors.small_logs import read
 from tests.runners.sensors.sphere_log import CENTRE, LIDAR, RADIUS, RIG, SphereLog
@@ -29,6 +37,7 @@ def test_the_registry_has_all_sensors_that_a_rig_can_name():
         if get_args(hints[field.name])[1:] == (Ellipsis,)
     }
     assert listed.pop("trajectories") is TrajectoryRig  # poses, which give no points
+    assert listed.pop("columns") is ColumnRig  # topics
     assert all(is_dataclass(kind) for kind in listed.values())
     assert all(len(getattr(EVERY, name)) > 0 for name in listed)
     named = sum(len(getattr(EVERY, name)) for name in listed)
