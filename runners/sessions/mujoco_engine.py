@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from chsel.errors import MeshWarning
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import compose
 from runners.sessions.configurations import Configuration
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 
 FRICTION = 1.0  # between hand and object, as the product of PyBullet's
 STIFFNESS = 100.0  # rad/s: natural frequency of the hand's holder, critically damped
+_MANY_FACES = 100_000
 _SURE = 0.001  # m: no part of the hand is as far from the points on it
 RADIUS = 1e-6  # m: half the thickness of the object's faces, which the engine wants above 0
 # The stiffest contact that is stable at this time step: 30 N press the hand in by some 0.02 mm.
@@ -64,6 +67,12 @@ class MuJoCoEngine:
         Raise SessionError where MuJoCo is not installed.
         """
         self._mujoco = mujoco = import_mujoco()
+        if len(mesh.faces) > _MANY_FACES:
+            text = (
+                f"the mesh has {len(mesh.faces)} faces, for which MuJoCo takes about a minute a "
+                "session for each 100 000; a coarser mesh is faster"
+            )
+            warnings.warn(MeshWarning("many_faces", text), stacklevel=2)
         settled = _settle(mujoco, mesh, laid=laid_down(mesh, configuration))
         self._mesh = probed_mesh(mesh, settings.faults)
         self._readings = TouchReadings()

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.errors import SessionError, SettingError
+from chsel.errors import MeshWarning, SessionError, SettingError
 from chsel.events import Probe
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from runners.objects.loader import load_model
-from runners.sessions import physics_engine
+from runners.sessions import mujoco_engine, physics_engine
 from runners.sessions.configurations import CONFIGURATIONS, FITTED
 from runners.sessions.physics_engine import ENGINES
 from runners.sessions.placement import laid_down, lowest
@@ -181,6 +181,16 @@ def test_contacts_can_be_with_the_convex_parts(capfd):
     assert len(next(session.probes()).contacts) >= 1
     session.close()
     assert capfd.readouterr().out == ""  # the decomposition is talkative
+
+
+def test_a_mesh_of_many_faces_is_told(monkeypatch):
+    mesh = _mesh("can")
+    settings = ProbingSettings(engine="mujoco")
+    monkeypatch.setattr(mujoco_engine, "_MANY_FACES", len(mesh.faces) - 1)
+    with pytest.warns(
+        MeshWarning, match=rf"the mesh has {len(mesh.faces)} faces, for which MuJoCo"
+    ):
+        open_probing("simulated", mesh, configuration_name="can", settings=settings, seed=0)
 
 
 def test_mujoco_touches_the_mesh_itself():
