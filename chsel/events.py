@@ -123,6 +123,7 @@ class Probe:
     contact_normals: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     # (4, 4): the true pose after the probe, where that moved the object and it is known.
     world_from_object: FloatArray | None = None
+    image_points: int = 0  # so many of the new known points, the last, are of an image
 
     @property
     def push(self) -> FloatArray | None:

@@ -488,10 +488,15 @@ def outside_of(on_object: FloatArray, free: FloatArray, *, spacing: float) -> Fl
     A ray that passes a voxel passes its centre at up to half the voxel's diagonal, so that nearer
     to the surface than this a centre may be inside the object.
     """
+    return free[~may_be_inside(on_object, free, spacing=spacing)]
+
+
+def may_be_inside(on_object: FloatArray, free: FloatArray, *, spacing: float) -> BoolArray:
+    """Return which of free centres (N, 3) a measured surface point can lie behind."""
     if len(on_object) == 0 or len(free) == 0:
-        return free
+        return np.zeros(len(free), dtype=np.bool_)
     from scipy.spatial import cKDTree  # which takes long to import
 
     margin = sqrt(0.75) * spacing
     nearest = cKDTree(on_object).query(free, distance_upper_bound=margin)[0]
-    return free[~(nearest <= margin)]
+    return np.asarray(nearest <= margin)

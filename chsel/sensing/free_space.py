@@ -153,6 +153,12 @@ class FreeGrid:
         self._fresh = []
         return self.lattice.centres(np.stack(np.unravel_index(voxels, self.shape), axis=1))
 
+    def forget(self, centres: FloatArray) -> None:
+        """Let the voxels with some centres (N, 3) be as if nothing had made them free."""
+        voxels = tuple(self.lattice.voxels(centres).T)
+        self._seen[np.ravel_multi_index(voxels, self.shape)] = 0
+        self.count -= len(centres)
+
     def _mark(self, kernel: Callable[..., None], *arguments: Any, count: int, least: int) -> None:
         """Run a kernel on pieces of range(count), of at least `least`, on several threads."""
 

@@ -27,7 +27,7 @@ from chsel.problem.points import (
     world_points,
 )
 from chsel.problem.poses import apply, inverse, nearest_rigid
-from chsel.sensing.depth_camera import DepthLook, PinholeCamera, depth_look, outside_of
+from chsel.sensing.depth_camera import DepthLook, PinholeCamera, depth_look, may_be_inside
 from chsel.sensing.free_space import FreeGrid, interior_lattice, poses_between
 
 if TYPE_CHECKING:
@@ -145,6 +145,7 @@ class Intake:
             gripper_path=perception.path[evenly_spaced(len(perception.path), _MOST_SHOWN)],
             contacts=perception.touched.known,
             contact_normals=perception.touched.normals,
+            image_points=len(seen.known),
         )
         image = None
         if look is not None:
@@ -177,16 +178,40 @@ class Intake:
             grid.from_depth(
                 look.ends, look.camera, world_from_camera=look.pose, mask=look.rays, fraction=1.0
             )
-        free = outside_of(surface, grid.new(), spacing=self._started.free_resolution)
-        known = KnownPoints(free=free).merged(prepared.probe.new_points)
+        free = grid.new()
+        doubtful = may_be_inside(surface, free, spacing=self._started.free_resolution)
+        grid.forget(free[doubtful])  # so that a hand that comes there later makes them free
+        known = KnownPoints(free=free[~doubtful]).merged(prepared.probe.new_points)
         probe = replace(prepared.probe, new_points=known)
         self._seen = np.concatenate([self._seen, prepared.seen])
         self._since = self._since.merged(prepared.touching)
         if self._moves and probe.push is not None:  # what was known has moved with the object
-            self._grid = FreeGrid(self._started.workspace, self._started.free_resolution)
-            self._seen = np.zeros((0, 3))
-            self._since = KnownPoints()
+            self._forget()
         return [probe] if prepared.image is None else [prepared.image, probe]
+
+    def retake(self, started: SessionStarted, probe: Probe) -> None:
+        """Take a probe that a session before this one has recorded.
+
+        started: its start, with the workspace.
+        """
+        self._started = started
+        if self._grid is None:
+            self._grid = FreeGrid(started.workspace, started.free_resolution)
+        self._grid.at(probe.new_points.free)
+        self._grid.new()
+        known = np.arange(len(probe.new_points.known))
+        touched = known < len(known) - probe.image_points
+        on_object = replace(probe.new_points, free=np.zeros((0, 3)))
+        self._since = self._since.merged(on_object.with_known(touched))
+        self._seen = np.concatenate([self._seen, on_object.known[~touched]])
+        if self._moves and probe.push is not None:
+            self._forget()
+
+    def _forget(self) -> None:
+        """Forget free space and places on an object that has moved."""
+        self._grid = FreeGrid(self._started.workspace, self._started.free_resolution)
+        self._seen = np.zeros((0, 3))
+        self._since = KnownPoints()
 
 
 def known_points(

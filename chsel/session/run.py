@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -201,7 +201,7 @@ class Run:
         """Register a problem of the step, and record it."""
         self.problem = problem
         self.check_points()
-        self.registered = register_recorded(
+        registered = register_recorded(
             ProblemPosed(problem.key.step, problem),
             self.method,
             recorder=self.recorder,
@@ -211,19 +211,33 @@ class Run:
             show=self._show,
             believe=partial(self._believe, problem) if self._with_belief else None,
         )
-        self.seconds |= self.registered.seconds
-        self.answer = self.registered.hypotheses
-        trust = self.answer.trust
-        if trust is not None:
-            self.trust = trust
-            if self._with_belief:
-                self.pose = self._stable(self.answer.world_from_object[0])
-            self.warn(check_trust(trust, noise_of(self.method)))
-            self.warn(check_prior(problem, self.answer))
+        self.seconds |= registered.seconds
+        answer = self._answer(registered)
+        if answer.trust is not None:
+            self.warn(check_trust(answer.trust, noise_of(self.method)))
+            self.warn(check_prior(problem, answer))
             if all(earlier.code != FLIPPED for earlier in self.warnings):
-                self.warn(check_normals(self.method, problem, hypotheses=self.answer))
-        self.belief = self.registered.belief or self.belief
-        return self.answer
+                self.warn(check_normals(self.method, problem, hypotheses=answer))
+        return answer
+
+    def take(self, problem: RegistrationProblem, registered: Registered) -> None:
+        """Let a result that a run before this one has recorded be that of the step."""
+        belief = None
+        if self._with_belief and registered.hypotheses.trust is not None:
+            belief = self._believe(problem, registered.hypotheses)
+        self.problem = problem
+        self.loop.remember(self._answer(replace(registered, belief=belief)))
+
+    def _answer(self, registered: Registered) -> Hypotheses:
+        """Return the result of the step, with what follows from it."""
+        self.registered = registered
+        answer = self.answer = registered.hypotheses
+        if answer.trust is not None:
+            self.trust = answer.trust
+            if self._with_belief:
+                self.pose = self._stable(answer.world_from_object[0])
+        self.belief = registered.belief or self.belief
+        return answer
 
     def _stable(self, world_from_object: FloatArray) -> FloatArray:
         """Return the copy (4, 4) of a pose that is nearest to the pose before."""
@@ -325,7 +339,9 @@ class Run:
     def warn(self, found: Iterable[InputWarning]) -> None:
         """Record warnings, each kind once a run."""
         for warning in found:
-            if warning.code not in {earlier.code for earlier in self.warnings}:
+            told = {earlier.code for earlier in self.warnings}
+            texts = {earlier.text for earlier in self.warnings}  # by a run before this one, too
+            if warning.code not in told and printable(warning.text) not in texts:
                 step = max(self.step, 0)
                 self.recorder.record(Logged(step, "warning", text=printable(warning.text)))
                 self.warnings.append(StepWarning(step, warning.code, text=warning.text))

@@ -5,11 +5,10 @@ CHSEL, Alg. 2, for programs.
 
 from __future__ import annotations
 
-import json
 import threading
 import warnings
-from collections.abc import Callable, Collection
-from dataclasses import asdict
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import replace
 from functools import wraps
 from pathlib import Path
 from types import TracebackType
@@ -19,8 +18,10 @@ import numpy as np
 
 from chsel.belief import Gripper, PoseBelief
 from chsel.errors import (
+    InputWarning,
     PointsError,
     PoseError,
+    RecordingError,
     SettingError,
     quoted,
     require_between,
@@ -37,7 +38,6 @@ from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import require_ieee_arithmetic
 from chsel.policies import POLICIES, build_policy
 from chsel.policies.policy import Policy
-from chsel.problem.mesh import clean_mesh, load_mesh
 from chsel.problem.object_symmetry import ObjectSymmetry
 from chsel.problem.points import (
     FREE_RESOLUTION,
@@ -53,11 +53,13 @@ from chsel.problem.sdf_grid import COARSEST, FINEST, OBJECT_PADDING, object_grid
 from chsel.problem.streams import StreamKey
 from chsel.sensing.depth_camera import PinholeCamera
 from chsel.sensing.free_space import FreeGrid
+from chsel.session.arguments import mesh_and_name, mesh_argument, name_of, plain_settings
 from chsel.session.judging import noise_of
 from chsel.session.loop import Phase
 from chsel.session.perception import Intake, Prepared, hand_bodies
 from chsel.session.recording import one_line, printable
 from chsel.session.rehearsal import warm_up, warm_up_policy, warm_up_sensing
+from chsel.session.resuming import retraced
 from chsel.session.run import Run, StepWarning
 
 if TYPE_CHECKING:
@@ -139,22 +141,22 @@ class Session:
         viewer.
         Raises ChselError for what cannot be used, and RecordingError if the file exists.
         """
-        mesh, name = _mesh_of(target)
+        mesh, name = mesh_and_name(target)
         if isinstance(method, str | None):
             method_name = default_method(preset) if method is None else method
             sensor = None if noise is None else {"noise": noise}
             chosen = method_settings(method_name, preset, settings, sensor)
             method = build_method(method_name, chosen)
         else:
-            method_name = _name_of("method", method, names=METHODS, build=build_method)
+            method_name = name_of("method", method, names=METHODS, build=build_method)
         if isinstance(policy, str):
             policy_name = policy
             policy = build_policy(policy)
         else:
-            policy_name = _name_of("policy", policy, names=POLICIES, build=build_policy)
+            policy_name = name_of("policy", policy, names=POLICIES, build=build_policy)
         if not isinstance(hand, HandShape | None):
             hand_bodies(hand)
-            hand = HandShape.of(_mesh("hand", hand))
+            hand = HandShape.of(mesh_argument("hand", hand))
         StreamKey(seed, 0)  # raises for an invalid seed
         require_positive("free_resolution", free_resolution)
         require_between("free_resolution", free_resolution, low=FINEST, high=COARSEST)
@@ -177,8 +179,8 @@ class Session:
         config = {
             "object": {"name": name},
             "session": {"kind": "live", **grid_settings} | ({"moves": moves} if moves else {}),
-            "method": {"name": method_name, **_plain(method.settings)},
-            "policy": {"name": policy_name, **_plain(policy.settings)},
+            "method": {"name": method_name, **plain_settings(method.settings)},
+            "policy": {"name": policy_name, **plain_settings(policy.settings)},
             "preset": {"name": preset},
             "seed": seed,
         }
@@ -200,14 +202,30 @@ class Session:
             moves=float(moves),
             prior=prior,
         )
+        opening = () if workspace is None else check_workspace(workspace, sdf.diameter)
+        self._open(recorder, grid, method=method, policy=policy, hand=hand, opening=opening)
+        if workspace is not None:
+            self._run.begin(self.started)
+
+    def _open(
+        self,
+        recorder: Recorder,
+        grid: FreeGrid | None,
+        *,
+        method: Method,
+        policy: Policy,
+        hand: HandShape | None,
+        opening: Iterable[InputWarning] = (),
+    ) -> None:
+        """Prepare a session whose start is known. Arguments as `Run`, `Intake` take them."""
         self.method = method
-        self.intake = Intake(self.started, grid, moves=moves)
+        self.intake = Intake(self.started, grid, moves=self.started.moves or 0.0)
         self._run = Run(
             method,
             recorder,
             policy=policy,
             with_belief=True,
-            opening=() if workspace is None else check_workspace(workspace, sdf.diameter),
+            opening=opening,
             advice="; nothing of the session is lost, and it goes on without a recording",
         )
         self._lock = threading.RLock()
@@ -220,8 +238,83 @@ class Session:
         warm_up_sensing()
         if hand is not None:
             warm_up_policy(policy)
-        if workspace is not None:
-            self._run.begin(self.started)
+
+    @classmethod
+    def resume(
+        cls,
+        path: str | Path,
+        *,
+        step: int | None = None,
+        method: str | Method | None = None,
+        policy: str | Policy | None = None,
+        hand: trimesh.Trimesh | HandShape | None = None,
+        record: str | Path | Recorder | None = None,
+        live: bool = False,
+    ) -> Self:
+        """Return a session that stands where a recording ends, or after one of its steps.
+
+        What comes next has the bits of the session that was recorded, had it gone on. The
+        recording stays as it is; `record`, another file, has all of it up to the step, and its
+        digest. A registration that was cut short does not count.
+        method, policy: others from there on; by default those of the recording. With another
+        method no recorded result counts, with another policy no recorded decision. hand: by default
+        that of the actions that were offered. record, live: as of a new session.
+        Raises RecordingError for a file that cannot be read or lacks the step, and where this
+        version computes other values.
+        """
+        from replay.comparing.choices import recorded_method, recorded_policy
+        from replay.files import file_digest
+        from replay.mcap.reader import read_recording
+
+        recording = read_recording(Path(path).expanduser())
+        steps = [probe.step for probe in recording.probes]
+        if step is not None and step not in steps:
+            shown = f"{min(steps)} to {max(steps)}" if steps else "none"
+            raise RecordingError(f"recording {path} has no step {step}; accepted: {shown}")
+        config = dict(recording.start.config)
+        same_method = method is None
+        same_policy = policy is None
+        if method is None:
+            method = recorded_method(recording).build()
+        elif isinstance(method, str):
+            method = build_method(method)
+        if policy is None:
+            is_there = isinstance(config.get("policy"), Mapping)
+            policy = recorded_policy(recording).build() if is_there else "expected_loss"
+        if isinstance(policy, str):
+            policy = build_policy(policy)
+        names = {
+            "method": name_of("method", method, names=METHODS, build=build_method),
+            "policy": name_of("policy", policy, names=POLICIES, build=build_policy),
+        }
+        config["method"] = {"name": names["method"], **plain_settings(method.settings)}
+        config["policy"] = {"name": names["policy"], **plain_settings(policy.settings)}
+        if hand is None and recording.offered is not None:
+            hand = recording.offered.hand
+        elif not isinstance(hand, HandShape | None):
+            hand_bodies(hand)
+            hand = HandShape.of(mesh_argument("hand", hand))
+        recorder, environment = _recorder(record, live)
+        session = cls.__new__(cls)
+        session.started = replace(
+            recording.start,
+            method=names["method"],
+            config=config,
+            environment=environment,
+            source=file_digest(Path(path).expanduser()),
+        )
+        session._open(recorder, None, method=method, policy=policy, hand=hand)
+        session._run.begin(session.started)
+        session._taken = retraced(
+            session._run,
+            session.intake,
+            events=recording.events(),
+            step=step,
+            with_results=same_method,
+            with_decisions=same_policy,
+        )
+        session._run.flush()
+        return session
 
     @property
     def points(self) -> KnownPoints:
@@ -556,35 +649,3 @@ def _recorder(record: str | Path | Recorder | None, live: bool) -> tuple[Recorde
         raise SettingError(f"record is {quoted(str(record))}; accepted: a name.mcap or name.rrd")
     files = {path.suffix[1:]: path} if path is not None else {}
     return open_recorder(files.get("mcap"), files.get("rrd"), live=live), environment()
-
-
-def _mesh_of(target: trimesh.Trimesh | str | Path) -> tuple[trimesh.Trimesh, str]:
-    """Return the object's mesh, and its name."""
-    if isinstance(target, str | Path):
-        return load_mesh(target), printable(Path(target).stem)
-    mesh = _mesh("target", target)
-    return clean_mesh(mesh.vertices, mesh.faces, name="target"), "object"
-
-
-def _mesh(name: str, given: Any) -> trimesh.Trimesh:
-    """Return what was given, if it is a mesh."""
-    import trimesh
-
-    require_instance(
-        name, given, kind=trimesh.Trimesh, accepted="a mesh such as chsel.load_mesh(path)"
-    )
-    return given
-
-
-def _name_of(what: str, built: Any, *, names: tuple[str, ...], build: Callable[[str], Any]) -> str:
-    """Return the name under which something is offered, by its class; else that of the class."""
-    if not hasattr(built, "settings"):
-        accepted = f"chsel.build_{what}(name), or name"
-        raise SettingError(f"{what} is {quoted(built)}; accepted: {accepted}")
-    offered = (name for name in names if type(build(name)) is type(built))
-    return next(offered, type(built).__name__)
-
-
-def _plain(settings: Any) -> dict[str, Any]:
-    """Return settings as recordings have them."""
-    return dict(json.loads(json.dumps(asdict(settings))))

@@ -105,6 +105,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "contacts": ("f8[C,3]", finite),
         "contact_normals": ("f8[C,3]", finite),
         "world_from_object": ("f8[4,4]?", rigid),
+        "image_points": "uint32",
     },
     # Closes a session's start and every probe, after the point clouds that it counts.
     "KnownPoints": {
