@@ -21,6 +21,7 @@ from runners.sensors.log.probe_windows import ProbeWindow
 from runners.sensors.log.transforms import JointHistory
 from runners.sensors.rig import BoxRig, HandRig
 from runners.sensors.session_report import Counts
+from runners.sensors.urdf import urdf_class
 
 if TYPE_CHECKING:
     import trimesh
@@ -133,22 +134,13 @@ def box_mesh(box: BoxRig) -> trimesh.Trimesh:
 
 def _robot(path: Path, where: str) -> Any:
     """Return the model of a URDF, with the meshes of its collision shapes."""
-    if not path.is_file():
-        raise SettingError(f"{where} does not exist; accepted: a URDF file")
-    try:
-        from yourdfpy import URDF  # optional: rigs of boxes need none
-    except ImportError:
-        raise SettingError(
-            f"{where} needs the package yourdfpy; install it where the project is: "
-            "pip install -e '.[sensors]'"
-        ) from None
-    refuse_special_file(where, path, error=SettingError)
+    reader = urdf_class(path, where)
     content = path.read_bytes()
     if b"<xacro:" in content:
         raise SettingError(f"{where} holds xacro macros; accepted: what the tool xacro makes")
     try:
         ElementTree.fromstring(content)  # yourdfpy logs what is wrong, and goes on
-        robot = URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+        robot = reader.load(str(path), build_scene_graph=False, load_meshes=False).robot
         leaders = {j.name for j in robot.joints if j.type in _MOVING and j.mimic is None}
         for joint in robot.joints:
             if joint.mimic is not None and joint.mimic.joint not in leaders:
@@ -158,7 +150,7 @@ def _robot(path: Path, where: str) -> Any:
             if joint.type not in _MOVING:  # planar and floating ones would shift others' values
                 joint.type = "fixed"
             joint.axis = joint.axis / np.sqrt((joint.axis**2).sum())
-        return URDF(
+        return reader(
             robot,
             build_scene_graph=False,
             build_collision_scene_graph=True,

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import SettingError
-from chsel.numerics.arrays import FloatArray, refuse_special_file
+from chsel.numerics.arrays import FloatArray
+from runners.sensors.urdf import urdf_class
 
 
 class Arm:
@@ -18,18 +19,9 @@ class Arm:
     def __init__(self, path: Path, root: str | None, *, link: str | None) -> None:
         """Read a URDF. root: the base, by default that of the file. Raise SettingError."""
         where = f"urdf {path}"
-        if not path.is_file():
-            raise SettingError(f"{where} does not exist; accepted: a URDF file")
-        refuse_special_file(where, path, error=SettingError)
+        reader = urdf_class(path, where)
         try:
-            from yourdfpy import URDF
-        except ImportError:
-            raise SettingError(
-                f"{where} needs the package yourdfpy; install it where the project is: "
-                "pip install -e '.[sensors]'"
-            ) from None
-        try:
-            self._robot: Any = URDF.load(str(path), build_scene_graph=True, load_meshes=False)
+            self._robot: Any = reader.load(str(path), build_scene_graph=True, load_meshes=False)
         except Exception as error:  # it raises whatever it stumbles over
             reason = " ".join(str(error).split())[:200]
             raise SettingError(f"{where} cannot be read ({reason}); accepted: a URDF") from None
