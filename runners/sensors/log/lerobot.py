@@ -74,7 +74,8 @@ class LeRobotEpisode:
             self._rows = _rows(self._file, self._episode, columns=list(self._readers))
         except (ChselError, OSError, KeyError, TypeError, ValueError) as error:
             reason = f"no {error}" if isinstance(error, KeyError) else str(error)
-            raise SessionError(f"dataset {path}: {' '.join(reason.split())}; {_ACCEPTED}") from None
+            accepted = "" if "accepted:" in reason else f"; {_ACCEPTED}"
+            raise SessionError(f"dataset {path}: {' '.join(reason.split())}{accepted}") from None
         self._columns = columns
         self.topics = {c.column: f"column/{_SCHEMAS.get(c.kind, c.kind)}" for c in columns}
         times = self._times()
