@@ -34,6 +34,18 @@ _PACKED = f"dtype ({', '.join(_DTYPES)}), shape and base64 of as many little-end
 
 
 @dataclass(frozen=True)
+class ResumeRequest(CheckedSettings):
+    """The arguments of `chsel.Session.resume`; source and record are names of files."""
+
+    source: str
+    step: Annotated[int | None, not_negative] = None
+    method: str | None = None
+    policy: str | None = None
+    hand: Any = None
+    record: str | None = None
+
+
+@dataclass(frozen=True)
 class OpenRequest(CheckedSettings):
     """The arguments of `chsel.Session`; record is the name of a file."""
 
@@ -66,21 +78,47 @@ def parsed(body: bytes) -> Json:
 
 def open_session(body: bytes, folder: Path) -> tuple[Session, Json]:
     """Return a new session, recorded in the folder, and the answer to its client."""
-    request = build_settings(OpenRequest, parsed(body), where="open")
+    given = parsed(body)
+    if "source" in given:
+        return _resumed(given, folder)
+    request = build_settings(OpenRequest, given, where="open")
     arguments = dict(vars(request))
     if not isinstance(request.target, str):  # whose path also names the object
         arguments["target"] = _mesh("target", request.target)
     if request.hand is not None:
         arguments["hand"] = _mesh("hand", request.hand)
     if request.record is not None:
-        if Path(request.record).name != request.record or not request.record.isprintable():
-            accepted = "accepted: a name, of a file in the server's folder"
-            raise SettingError(f"record is {quoted(request.record)}; {accepted}")
-        arguments["record"] = str(folder.resolve() / request.record)
+        arguments["record"] = _file("record", request.record, folder=folder)
     arguments["prior"] = prior_from_settings("prior", request.prior)
     arguments["symmetry"] = symmetry_from_settings("symmetry", request.symmetry)
     session = Session(**arguments)
     return session, {"object": session.started.object, "record": arguments["record"]}
+
+
+def _resumed(given: Json, folder: Path) -> tuple[Session, Json]:
+    """Return a session that goes on from a recording in the folder, and the answer."""
+    request = build_settings(ResumeRequest, given, where="open")
+    record = None
+    if request.record is not None:
+        record = _file("record", request.record, folder=folder)
+    session = Session.resume(
+        _file("source", request.source, folder=folder),
+        step=request.step,
+        method=request.method,
+        policy=request.policy,
+        hand=None if request.hand is None else _mesh("hand", request.hand),
+        record=record,
+    )
+    about = {"object": session.started.object, "record": record, "step": session.step}
+    return session, about
+
+
+def _file(name: str, given: str, *, folder: Path) -> str:
+    """Return the path of a file in the server's folder. Raise SettingError for other places."""
+    if Path(given).name != given or not given.isprintable():
+        accepted = "accepted: a name, of a file in the server's folder"
+        raise SettingError(f"{name} is {quoted(given)}; {accepted}")
+    return str(folder.resolve() / given)
 
 
 def add(session: Session, values: Json) -> Json:

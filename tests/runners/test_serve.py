@@ -141,6 +141,36 @@ def test_a_symmetry_is_that_of_the_library(server):
     assert ask(address, "/sessions", target=TARGET, symmetry="all")[0] == 400
 
 
+def test_a_session_goes_on_from_a_recording_of_the_server(server):
+    address, folder = server
+    path = opened(address, record="monday.mcap")
+    ask(address, f"{path}/add", contacts=ON_BOX[:4])
+    first = ask(address, f"{path}/register", body=b"")[1]
+    ask(address, f"{path}/add", contacts=ON_BOX[4:])
+    second = ask(address, f"{path}/register", body=b"")[1]
+    ask(address, f"{path}/close", body=b"")
+    given = {"source": "monday.mcap", "record": "tuesday.mcap", "step": 0}
+    status, answer = ask(address, "/sessions", **given)
+    assert (status, answer["step"]) == (200, 0)
+    path = f"/sessions/{answer['session']}"
+    found = ask(address, f"{path}/register", body=b"")[1]
+    assert found["object_from_world"] == first["object_from_world"]
+    ask(address, f"{path}/add", contacts=ON_BOX[4:])
+    found = ask(address, f"{path}/register", body=b"")[1]
+    assert found["object_from_world"] == second["object_from_world"]
+    ask(address, f"{path}/close", body=b"")
+    assert outcomes(folder / "tuesday.mcap") == ([0, 1], "finished")
+    for wrong, text in (
+        ({"source": "../monday.mcap"}, "source is '../monday.mcap'; accepted: a name"),
+        ({"source": "monday.mcap", "step": 5}, "has no step 5; accepted: 0 to 1"),
+        ({"source": "none.mcap"}, "none.mcap"),
+        ({"source": "monday.mcap", "target": TARGET}, "target"),
+    ):
+        status, answer = ask(address, "/sessions", **wrong)
+        assert status == 400
+        assert text in answer["error"]
+
+
 def test_a_prior_is_that_of_the_library(server):
     address, folder = server
     prior = {"centre": [0.0, 0.01, 0.0], "centre_noise": 0.02}
