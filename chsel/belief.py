@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -83,6 +83,15 @@ class Mode:
         """Root mean squares of how far members are off: of the centre, metres, and radians."""
         squares = np.diagonal(self.covariance)
         return float(np.sqrt(squares[:3].sum())), float(np.sqrt(squares[3:].sum()))
+
+
+class Ball(NamedTuple):
+    """A pose, and how far from it the farthest member is."""
+
+    world_from_object: FloatArray  # (4, 4)
+    radius: float  # root mean square distance of the surfaces, metres
+    centre: float  # of the object's centre, metres
+    turn: float  # radians, but for symmetries
 
 
 @dataclass(frozen=True)
@@ -219,6 +228,19 @@ class PoseBelief:
             covariances=np.array([mode.covariance for mode in self.modes]).reshape(-1, 6, 6),
             spread=self.spread,
         )
+
+    @cached_property
+    def ball(self) -> Ball:
+        """The member from which no other is as far as from all others, and how far they are.
+
+        A planner that takes this pose is off by at most so much, if one of the members is right.
+        """
+        apart = distances_apart(self._sdf, self._poses).max(axis=1)
+        middle = int(np.argmin(apart))
+        own = self.object_from_world[middle]
+        off = pose_offsets(self._symmetry, own, others=self.object_from_world)
+        centre, turn = np.sqrt((off.reshape(-1, 2, 3) ** 2).sum(axis=2)).max(axis=0)
+        return Ball(inverse(own), float(apart[middle]), centre=float(centre), turn=float(turn))
 
     @property
     def spread(self) -> float:

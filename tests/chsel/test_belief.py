@@ -10,9 +10,10 @@ from scipy.stats import norm
 import chsel
 from chsel.belief import Gripper, PoseBelief, wilson
 from chsel.plausible.symmetry import object_symmetry
-from chsel.problem.poses import axis_angle, compose, inverse, rotation_vector
+from chsel.problem.poses import Poses, axis_angle, compose, inverse, rotation_vector
 from chsel.problem.registration_problem import Hypotheses, Trust
 from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.surface import outline_distances
 
 SIDES = np.array([0.20, 0.06, 0.08])
 BOX = trimesh.creation.box(SIDES)
@@ -84,6 +85,21 @@ def test_modes_have_weights_covariances_and_numbers_that_stay():
     assert wide.modes == []
     after = PoseBelief(L_GRID, result(later, (0, 1, 2)), previous=wide)
     assert [mode.number for mode in after.modes] == [1, 0, 2]
+
+
+def test_the_ball_is_about_the_member_in_the_middle():
+    """Places 0, 2, 5 and 11 mm along z: from the third the others are at most 6 mm away."""
+    shifts = np.array([0.0, 0.002, 0.005, 0.011])[:, None] * Z
+    poses = shifted(shifts, about=np.eye(4))
+    ball = PoseBelief(L_GRID, result(poses, verdict="wide")).ball
+    np.testing.assert_allclose(ball.world_from_object, poses[2], atol=1e-12)
+    assert ball.centre == pytest.approx(0.006)
+    assert ball.turn == pytest.approx(0.0, abs=1e-9)
+    both = Poses.of(inverse(poses[[2, 3]]))
+    assert ball.radius == pytest.approx(outline_distances(L_GRID, both)[0, 1])
+    turned = np.stack([np.eye(4), compose(axis_angle(Z, np.array(0.3)), np.zeros(3)), np.eye(4)])
+    ball = PoseBelief(L_GRID, result(turned, verdict="wide")).ball
+    assert ball.turn == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize("mesh", [BOX, trimesh.creation.cylinder(0.03, 0.1)])
