@@ -197,6 +197,7 @@ class Intake:
         self._started = started
         if self._grid is None:
             self._grid = FreeGrid(started.workspace, started.free_resolution)
+            self._grid.at(started.initial_points.free)
         self._grid.at(probe.new_points.free)
         self._grid.new()
         known = np.arange(len(probe.new_points.known))

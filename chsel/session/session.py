@@ -268,8 +268,10 @@ class Session:
 
         recording = read_recording(Path(path).expanduser())
         steps = [probe.step for probe in recording.probes]
+        if not steps:
+            raise RecordingError(f"recording {path} has no probe; accepted: a new session")
         if step is not None and step not in steps:
-            shown = f"{min(steps)} to {max(steps)}" if steps else "none"
+            shown = f"{min(steps)} to {max(steps)}"
             raise RecordingError(f"recording {path} has no step {step}; accepted: {shown}")
         config = dict(recording.start.config)
         same_method = method is None
@@ -305,14 +307,18 @@ class Session:
         )
         session._open(recorder, None, method=method, policy=policy, hand=hand)
         session._run.begin(session.started)
-        session._taken = retraced(
-            session._run,
-            session.intake,
-            events=recording.events(),
-            step=step,
-            with_results=same_method,
-            with_decisions=same_policy,
-        )
+        try:
+            session._taken = retraced(
+                session._run,
+                session.intake,
+                events=recording.events(),
+                step=step,
+                with_results=same_method,
+                with_decisions=same_policy,
+            )
+        except Exception as error:
+            session.close(f"failed: {one_line(error)}")  # so that the new file has an end
+            raise
         session._run.flush()
         return session
 

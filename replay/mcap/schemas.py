@@ -232,7 +232,6 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "covariances": ("f8[M,6,6]", finite),
         "spread": ("double", between(0.0, 1e6, unit="m")),
     },
-    # No topic: this is the attachment "sdf_grid".
     # Proper rotations about the centre, their products with those about the axis, or all rotations.
     "Symmetry": {
         "centre": ("f8[3]", finite),
@@ -240,6 +239,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "axis": ("f8[3]?", finite),
         "sphere": "bool",
     },
+    # No topic: this is the attachment "sdf_grid".
     "SdfGrid": {
         "origin": "f8[3]",
         "resolution": "double",

@@ -68,16 +68,23 @@ class LeRobotEpisode:
         try:
             info = _info(path)
             self._file, self._episode = _data_file(path, info, episode=episode)
-            self._readers = {
-                column.column: _reader(column, info, folder=path) for column in columns
-            }
+            self._readers: dict[str, list[Read]] = {}  # a column may say several things
+            for column in columns:
+                reader = _reader(column, info, folder=path)
+                self._readers.setdefault(column.column, []).append(reader)
             self._rows = _rows(self._file, self._episode, columns=list(self._readers))
+        except ModuleNotFoundError as error:
+            raise SessionError(
+                f"dataset {path} needs the package {error.name}; install it where the project is: "
+                "pip install -e '.[sensors]'"
+            ) from None
         except (ChselError, OSError, KeyError, TypeError, ValueError) as error:
             reason = f"no {error}" if isinstance(error, KeyError) else str(error)
             accepted = "" if "accepted:" in reason else f"; {_ACCEPTED}"
             raise SessionError(f"dataset {path}: {' '.join(reason.split())}{accepted}") from None
-        self._columns = columns
-        self.topics = {c.column: f"column/{_SCHEMAS.get(c.kind, c.kind)}" for c in columns}
+        self.topics = {}
+        for column in sorted(columns, key=lambda column: column.kind in _SCHEMAS):
+            self.topics[column.column] = f"column/{_SCHEMAS.get(column.kind, column.kind)}"
         times = self._times()
         self.begin = int(times[0])
         self.end = int(times[-1])
@@ -86,15 +93,14 @@ class LeRobotEpisode:
         """Yield what columns say, row by row."""
         faults: Counter[str] = Counter()
         for number, time in enumerate(self._times().tolist()):
-            for name, read in self._readers.items():
-                if name not in topics:
-                    continue
+            for name in [name for name in self._readers if name in topics]:
                 values = np.ravel(np.asarray(self._rows[name][number], dtype=np.float64))
-                try:
-                    for content in read(values):
-                        yield Received(name, time, stamp=None, content=content)
-                except ChselError as error:
-                    faults[f"{name}: {error}"] += 1
+                for read in self._readers[name]:
+                    try:
+                        for content in read(values):
+                            yield Received(name, time, stamp=None, content=content)
+                    except ChselError as error:
+                        faults[f"{name}: {error}"] += 1
         self.faults |= faults
 
     def listing(self) -> str:

@@ -160,9 +160,24 @@ def test_what_cannot_be_resumed_is_one_line(whole, tmp_path):
         chsel.Session.resume(path, step=9)
     with pytest.raises(RecordingError, match="exists"):
         chsel.Session.resume(path, record=path)
+    with chsel.Session(mesh(), record=tmp_path / "empty.mcap"):
+        pass
+    with pytest.raises(RecordingError, match=r"empty\.mcap has no probe; accepted: a new session"):
+        chsel.Session.resume(tmp_path / "empty.mcap")
     other = tmp_path / "none.mcap"
     with pytest.raises(RecordingError, match=r"none\.mcap"):
         chsel.Session.resume(other)
+
+
+def test_a_version_that_finds_other_values_says_so_and_ends_the_new_file(
+    whole, tmp_path, monkeypatch
+):
+    record = tmp_path / "on.mcap"
+    resumed = chsel.build_method("anchored", {"limit": 8.0})
+    monkeypatch.setattr("replay.comparing.choices.Choice.build", lambda choice: resumed)
+    with pytest.raises(RecordingError, match="step 1 of the recording has"):
+        chsel.Session.resume(whole[0], step=1, policy="information", record=record)
+    assert read_recording(record).ended.outcome.startswith("failed: step 1 of the recording has")
 
 
 def test_an_object_that_moved_goes_on_to_the_bit(tmp_path):

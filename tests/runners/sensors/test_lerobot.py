@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -235,6 +236,22 @@ def test_what_a_dataset_lacks_is_one_line(copied, columns, episode, message):
     with pytest.raises(SessionError, match=rf"^dataset .*dataset: .*{message}") as raised:
         LeRobotEpisode(copied, columns, episode=episode)
     assert str(raised.value).count("accepted: ") == 1
+
+
+def test_a_column_may_say_several_things(copied):
+    """The place and turn of the hand, and behind them how far its gripper is open."""
+    gripper = ColumnRig("observation.state", "joints", select=(7,), joints=("gripper",), unit="m")
+    episode = LeRobotEpisode(copied, (gripper, POSE), episode=0)
+    contents = [one.content for one in episode.messages(["observation.state"])]
+    assert contents[::2] == [{"gripper": 0.5}] * 3
+    assert [content.child for content in contents[1::2]] == ["hand"] * 3
+    assert episode.topics == {"observation.state": "column/TransformStamped"}
+
+
+def test_a_missing_package_is_one_line(copied, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow.dataset", None)
+    with pytest.raises(SessionError, match=r"needs the package pyarrow.*\.\[sensors\]"):
+        LeRobotEpisode(copied, (POSE,), episode=0)
 
 
 def test_another_version_or_a_log_is_refused(copied, tmp_path):
