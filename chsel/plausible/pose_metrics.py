@@ -17,6 +17,8 @@ from chsel.problem.poses import Poses, inverse, product, rotated
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.sdf_grid import FARTHEST, SdfGrid
 
+_NEAR = 10.0  # mm, between surfaces: as near as makes a pose of a set the same as another
+
 
 def pose_errors(
     object_from_world: FloatArray, world_from_object: FloatArray, *, symmetry: ObjectSymmetry
@@ -100,6 +102,8 @@ class PlausibleDiversity:
 
     coverage: float  # mean over plausible poses of the distance to the nearest hypothesis
     plausibility: float  # mean over hypotheses of the distance to the nearest plausible pose
+    precision: float  # share of hypotheses near a plausible pose
+    recall: float  # share of plausible poses near a hypothesis
 
     @property
     def diversity(self) -> float:
@@ -115,6 +119,8 @@ class PlausibleDiversity:
 def plausible_diversity(distances: FloatArray) -> PlausibleDiversity:
     """Return the metrics of distances d (B, P) in mm^2, of hypotheses and plausible poses.
 
+    Poses are near each other up to a root mean square distance of 10 mm. Precision and recall of
+    pose sets are those of BOP-Distrib (Meden et al., 2024), with this distance in place of theirs.
     Raises EvaluationError if there is none of either.
     """
     if distances.ndim != 2 or 0 in distances.shape:
@@ -123,7 +129,12 @@ def plausible_diversity(distances: FloatArray) -> PlausibleDiversity:
             "and one plausible pose"
         )
     nearest_hypothesis, nearest_member = distances.min(axis=0), distances.min(axis=1)
-    return PlausibleDiversity(float(nearest_hypothesis.mean()), float(nearest_member.mean()))
+    return PlausibleDiversity(
+        coverage=float(nearest_hypothesis.mean()),
+        plausibility=float(nearest_member.mean()),
+        precision=float((nearest_member <= _NEAR**2).mean()),
+        recall=float((nearest_hypothesis <= _NEAR**2).mean()),
+    )
 
 
 def true_pose_rank(

@@ -46,14 +46,16 @@ RESULTS = _schema(
     (_COUNT, "members kept local"),
     (_NUMBER, "true_cost"),
     (_COUNT, "hypotheses distinct"),
-    (_NUMBER, "best_cost mean_cost coverage plausibility diversity root"),
+    (_NUMBER, "best_cost mean_cost coverage plausibility diversity root precision recall"),
     (_NUMBER, "position_error rotation_error rank"),
     (_FLAG, "truth_held"),
     (_NUMBER, "nearest_hypothesis nearest_position nearest_rotation exact_members seconds"),
     (_TEXT, "digest problem_digest"),
 )
 """A row a (configuration, seed, method, step). Lengths in metres, angles in radians, but coverage,
-plausibility and diversity (PD) in mm^2 and root, of PD, in mm. definition: of the plausible set.
+plausibility and diversity (PD) in mm^2 and root, of PD, in mm. precision: share of hypotheses whose
+surface is within 10 mm, root mean square, of that in a plausible pose; recall: share of plausible
+poses with such a hypothesis. definition: of the plausible set.
 position_error, rotation_error: of the best hypothesis, modulo the object's symmetries, at its
 centre. nearest_hypothesis: root mean square distance of the true pose's surface from that of the
 nearest hypothesis, whose errors are nearest_position and nearest_rotation. truth_held: whether the

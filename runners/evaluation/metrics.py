@@ -87,13 +87,16 @@ class HypothesisMetrics:
         found: Hypotheses | None,
         ranked: bool = True,
     ) -> dict[str, float]:
-        """Return coverage, plausibility and diversity in mm^2, its root, and if wanted the rank."""
+        """Return coverage, plausibility, diversity (mm^2), its root (mm), precision and recall.
+
+        ranked: the rank of the true pose, too.
+        """
         if found is None or len(found.cost) == 0:
             return {}
         distance = self._surface_distance(problem)
         chosen = found.object_from_world[cheapest(found.cost, self._config.quantile)]
         metrics = plausible_diversity(distance.between(chosen, members.world_from_object))
-        names = ("coverage", "plausibility", "diversity", "root")
+        names = ("coverage", "plausibility", "diversity", "root", "precision", "recall")
         row = {"distinct": found.distinct, **{name: getattr(metrics, name) for name in names}}
         if ranked and len(chosen) > 1:
             row["rank"] = true_pose_rank(distance, chosen, world_from_object=self._truth)

@@ -103,6 +103,10 @@ _FAULTY_COLUMNS = {  # title and unit of the table, factor
     "position_error": ("Position error of the best hypothesis, mm", _MM),
     DIVERSITY: (_PD, 1.0),
 }
+_NEAR = {  # by column
+    "precision": "Precision: share of hypotheses within 10 mm of a plausible pose",
+    "recall": "Recall: share of plausible poses with a hypothesis within 10 mm",
+}
 _MOMENTS = {DIVERSITY: _PD, "mean_cost": "mean relaxed cost of the best cells"}
 _OTHER_COST = "medial_constraint"  # methods that begin so search by another cost, in m^2
 _QUARTILES = ["count", "lower", "median", "upper"]
@@ -294,6 +298,8 @@ def against_baseline(evaluation: Evaluation, baseline: str) -> list[Table]:
                 f"ratio to {baseline} [95 %]": with_range(mean, lower=least, upper=most),
                 "worse": "-" if method == baseline else worse,
                 "members": percent(own["exact_members"].mean()),
+                "precision": percent(own["precision"].mean()),
+                "recall": percent(own["recall"].mean()),
                 "distinct [least]": f"{number(distinct.mean())} [{number(distinct.min())}]",
                 "s, median": float(own["seconds"].median()),
                 "s, mean": float(own["seconds"].mean()),
@@ -301,6 +307,8 @@ def against_baseline(evaluation: Evaluation, baseline: str) -> list[Table]:
         )
     note = (
         f"Members: mean share of hypotheses in the plausible set, {evaluation.definition_text}. "
+        "Precision: mean share of hypotheses within 10 mm of one of its poses; recall: mean share "
+        "of its poses with such a hypothesis. "
         "Intervals by a bootstrap over configurations, or over sessions if these are few."
     )
     tables = [table_of("PD and its ratios over all registrations", lines, note=note)]
@@ -351,10 +359,14 @@ def _calibration(half: pd.DataFrame, styles: Styles) -> list[Table]:
     note = "0.5 in the median for a set that spreads as far as it errs; small: the truth is outside"
     title = "Rank of the true pose among the hypotheses"
     share = "Share of hypotheses in the plausible set"
-    return [
+    tables = [
         method_table(title, ranks, by="object", styles=styles, column="rank", note=note),
         method_table(share, members, by="object", styles=styles, column="exact_members"),
     ]
+    for column, text in _NEAR.items():
+        own = half[half[column].notna()]
+        tables.append(method_table(text, own, by="object", styles=styles, column=column))
+    return tables
 
 
 def _on_policies(

@@ -14,7 +14,12 @@ from runners.reporting.figures import Styles
 from runners.reporting.statistics import DIVERSITY, spreads
 
 Best = Literal["min", "max"] | None  # which number of a row is best
-_BEST: dict[str, Best] = {"rank": None, "exact_members": "max"}  # by column; of others "min"
+_BEST: dict[str, Best] = {
+    "rank": None,
+    "exact_members": "max",
+    "precision": "max",
+    "recall": "max",
+}  # by column; of others "min"
 
 
 @dataclass(frozen=True)

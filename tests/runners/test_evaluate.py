@@ -107,6 +107,8 @@ def test_the_table_has_a_row_a_registration_that_the_recordings_confirm(folder):
         assert row["root"] == pytest.approx(row["diversity"] ** 0.5)
         assert row["seconds"] > 0.0
         assert 0.0 <= row["exact_members"] <= 1.0
+        assert 0.0 <= row["precision"] <= 1.0
+        assert 0.0 <= row["recall"] <= 1.0
         recording = read_recording(folder / TRIAL / f"{row['method']}.mcap")
         step = row["step"]
         assert row["digest"] == recording.hypotheses(step).digest

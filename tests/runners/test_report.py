@@ -133,14 +133,15 @@ def test_true_poses_that_were_sought_have_a_table_of_their_own(tmp_path):
 @pytest.fixture
 def compared(tmp_path):
     """Two draws of the package and of an anchored method, at two steps of a trial."""
-    numbers = {"exact_members": 0.5, "distinct": 30, "seconds": 0.1}
+    numbers = {"exact_members": 0.5, "precision": 0.9, "recall": 0.25}
+    numbers |= {"distinct": 30, "seconds": 0.1}
     found = [
         ("package", 4, {"diversity": 100.0, "distinct": 12, "seconds": 2.0}),
         ("package+1", 4, {"diversity": 400.0, "distinct": 10, "seconds": 4.0}),
         ("package", 5, {"diversity": 100.0, "distinct": 8, "seconds": 3.0}),
         ("package+1", 5, {"diversity": 100.0, "distinct": 30, "seconds": 3.0}),
         ("own", 4, {"diversity": 20.0, **numbers}),
-        ("own+1", 4, {"diversity": 400.0, **numbers, "exact_members": 0.8}),
+        ("own+1", 4, {"diversity": 400.0, **numbers, "exact_members": 0.8, "recall": 0.55}),
         ("own", 5, {"diversity": 0.0, **numbers}),
     ]
     rows = [row("can", 0, method=method, step=step, **values) for method, step, values in found]
@@ -161,11 +162,14 @@ def test_ratios_are_of_the_same_trial_and_step_by_the_mean_of_the_baselines_draw
         "ratio to package [95 %]": "0.126",  # of 20 / 200, 400 / 200 and 1 / 100
         "worse": "33.3 %",
         "members": "60.0 %",
+        "precision": "90.0 %",
+        "recall": "35.0 %",
         "distinct [least]": "30 [30]",
         "s, median": "0.1",
         "s, mean": "0.1",
     }
-    by_hand = ["package", "4", "100 [100, 175]", "141", "1", "-", "-", "15 [8]", "3", "3"]
+    by_hand = ["package", "4", "100 [100, 175]", "141", "1", "-", "-", "-", "-", "15 [8]"]
+    by_hand += ["3", "3"]
     assert package == by_hand
     steps = tables["Ratios of PD by step, geometric means"]
     assert steps == [["step", "own", "package"], ["4", "0.447", "1"], ["5", "0.01", "1"]]

@@ -108,6 +108,14 @@ def test_coverage_and_plausibility_are_the_means_of_the_nearest():
     assert metrics.root == pytest.approx(5.5**0.5)
 
 
+def test_precision_and_recall_count_poses_within_10_mm():
+    """Of three hypotheses two are near a plausible pose; of four of these one is near none."""
+    squares = np.array([[100.0, 900.0, 101.0, 4.0], [400.0, 0.0, 900.0, 900.0], [101.0] * 4])
+    metrics = plausible_diversity(squares)
+    assert metrics.precision == pytest.approx(2.0 / 3.0)
+    assert metrics.recall == pytest.approx(3.0 / 4.0)
+
+
 def test_threads_change_nothing(box):
     distance = distance_of(box)
     estimates = inverse(poses(11, 9))
