@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 import socket
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,13 +60,17 @@ def main(config: DictConfig) -> None:
         host, port = listening.getsockname()
         console.print(f"serving at http://{host}:{port}, recordings in {folder}/, until Ctrl-C")
         console.print(f"token: {token}" if not given else "token: that of CHSEL_TOKEN")
+        server = Server(token, folder)
         web.run_app(
-            Server(token, folder).app,
+            server.app,
             sock=listening,
             print=lambda *_: None,
             access_log=None,
             shutdown_timeout=PATIENCE,
         )
+    if server.is_computing:  # for nobody: Python would wait for it
+        sys.stderr.flush()
+        os._exit(0)
 
 
 if __name__ == "__main__":

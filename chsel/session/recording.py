@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -142,7 +143,7 @@ class SessionRecorder(Recorder):
     """Hands events to another recorder, each checked as soon as it comes.
 
     Where that recorder fails, as on a full disk, the next `flush` or `close` raises its error,
-    once. What follows is not recorded, so that the session can go on.
+    once. What follows is not recorded, so that the session can go on; nor is what follows `end`.
     """
 
     def __init__(self, recorder: Recorder, advice: str = "") -> None:
@@ -150,10 +151,12 @@ class SessionRecorder(Recorder):
         self._recorder, self._advice = recorder, advice
         self._error: RecordingError | None = None  # that is not raised yet
         self._failed = False
+        self._ended = False
+        self._lock = threading.RLock()  # another thread may end it
 
     def check(self, event: Event) -> None:
         """Raise RecordingError for an event that cannot be recorded."""
-        if not self._failed:
+        if not self._failed and not self._ended:
             self._recorder.check(event)
 
     def record(self, event: Event) -> None:
@@ -176,12 +179,27 @@ class SessionRecorder(Recorder):
             self._error = None
         self._raise()
 
+    def end(self, events: Sequence[Event]) -> None:
+        """Record the last events and close, whatever another thread still has to record."""
+        with self._lock:
+            try:
+                for event in events:
+                    self.record(event)
+            finally:
+                try:
+                    self.close()
+                finally:
+                    self._ended = True
+
     def _attempt(self, call: Callable[[], None]) -> None:
-        try:
-            call()
-        except RecordingError as error:
-            self._error = self._error or error
-            self._failed = True
+        with self._lock:
+            if self._ended:
+                return
+            try:
+                call()
+            except RecordingError as error:
+                self._error = self._error or error
+                self._failed = True
 
     def _raise(self) -> None:
         error, self._error = self._error, None

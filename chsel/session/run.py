@@ -358,12 +358,9 @@ class Run:
         self.recorder.flush()
 
     def end(self, outcome: str = "finished") -> None:
-        """End the recording."""
+        """End the recording, also where another thread registers: what that finds is lost."""
         step = max(self.step, 0)
         level = "info" if outcome == "finished" else "warning"
         self.loop.end()
-        try:
-            self.recorder.record(Logged(step, level, text=f"session {outcome}"))
-            self.recorder.record(SessionEnded(step, outcome))
-        finally:
-            self.recorder.close()
+        said = Logged(step, level, text=f"session {outcome}")
+        self.recorder.end([said, SessionEnded(step, outcome)])

@@ -611,6 +611,12 @@ class Session:
             self._run.begin(self.started)
         self._run.end(printable(outcome))
 
+    def interrupt(self) -> None:
+        """End the recording at once, also where another thread registers: what it finds is lost."""
+        if not self._closed and self._run.has_begun:
+            self._closed = True
+            self._run.end("interrupted")
+
     def __enter__(self) -> Self:
         return self
 

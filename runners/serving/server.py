@@ -21,7 +21,7 @@ from replay.console import print_error
 from runners.serving import messages
 
 MOST_BYTES = 256 * 2**20  # of a request
-PATIENCE = 0.5  # seconds that clients have to finish a request once the server ends
+PATIENCE = 0.5  # seconds that requests have to finish once the server ends
 _LONGEST_LINE = 2**16  # bytes, so that a long name is answered as others are
 _WITH_HEADER = 32 + zlib.MAX_WBITS  # of zlib: that of gzip or of deflate
 _LOGGER = logging.getLogger(__name__)  # of aiohttp, about what clients do wrong
@@ -45,6 +45,7 @@ class Server:
         self._served: dict[str, _Served] = {}
         self._count = 0  # sessions opened so far
         self._ending = False  # nothing is begun any more
+        self.is_computing = False  # for a session whose recording has ended
         self._opener = ThreadPoolExecutor(1)  # which compiles kernels and makes grids
         connections = {"logger": _LOGGER, "max_line_size": _LONGEST_LINE, "auto_decompress": False}
         self.app = web.Application(
@@ -124,20 +125,33 @@ class Server:
             raise web.HTTPServiceUnavailable(text="the server ends; accepted: nothing more")
 
     async def _close_all(self, _: web.Application) -> None:
-        """End every recording, each as soon as nothing is being computed for its session."""
+        """End every recording, also of sessions for which something is still being computed."""
         self._ending = True
         await self._close_served()
-        await _in_thread(self._opener, self._served.copy)  # once no session is being opened
+        opened = asyncio.ensure_future(_in_thread(self._opener, self._served.copy))
+        await asyncio.wait([opened], timeout=PATIENCE)
+        self.is_computing = self.is_computing or not opened.done()
         await self._close_served()
 
     async def _close_served(self) -> None:
         served, self._served = self._served, {}
-        closing = [
-            _in_thread(each.thread, each.session.close, "interrupted") for each in served.values()
-        ]
-        for ended in await asyncio.gather(*closing, return_exceptions=True):
-            if isinstance(ended, Exception):
-                print_error(one_line(ended))
+        closing = {
+            asyncio.ensure_future(_in_thread(each.thread, each.session.close, "interrupted")): each
+            for each in served.values()
+        }
+        if not closing:
+            return
+        done, computing = await asyncio.wait(closing, timeout=PATIENCE)
+        for ended in done:
+            error = ended.exception()
+            if error is not None:
+                print_error(one_line(error))
+        for waiting in computing:
+            self.is_computing = True
+            try:
+                closing[waiting].session.interrupt()
+            except ChselError as error:
+                print_error(one_line(error))
 
 
 async def _body(request: web.Request) -> bytes:

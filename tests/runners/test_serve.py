@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import gzip
+import http.client
 import json
 import os
 import re
@@ -24,8 +25,7 @@ import trimesh
 from aiohttp import web
 
 import chsel
-from chsel.errors import SessionError
-from replay.comparing.verification import EQUAL, verify
+from replay.comparing.verification import EQUAL, NO_RESULT, verify
 from replay.mcap.reader import read_recording
 from runners.serving.server import Server
 from tests.chsel.samples import REPOSITORY
@@ -373,9 +373,7 @@ def test_the_command_serves_until_a_signal_whatever_clients_do(tmp_path, ending)
     assert served.stderr.read() == ""
 
 
-def test_a_computation_holds_up_no_other_recording_and_what_waits_is_not_begun(
-    tmp_path, monkeypatch
-):
+def test_the_end_waits_for_no_computation_and_what_waits_is_not_begun(tmp_path, monkeypatch):
     entered = threading.Event()
     go_on = threading.Event()
     begun = []
@@ -384,8 +382,9 @@ def test_a_computation_holds_up_no_other_recording_and_what_waits_is_not_begun(
         begun.append(session)
         entered.set()
         assert go_on.wait(600)
-        raise SessionError("enough")
+        return found(session)
 
+    found = chsel.Session.register
     monkeypatch.setattr(chsel.Session, "register", slow)
     listening = socket.create_server(("127.0.0.1", 0))
     loop = asyncio.new_event_loop()
@@ -404,20 +403,47 @@ def test_a_computation_holds_up_no_other_recording_and_what_waits_is_not_begun(
         asked.append(pool.submit(ask, address, f"{busy}/register", b""))
         time.sleep(0.2)  # so that it waits
         ended = asyncio.run_coroutine_threadsafe(runner.cleanup(), loop)
-        while not is_ended(tmp_path / "idle.mcap"):
-            time.sleep(0.01)
-        assert not is_ended(tmp_path / "busy.mcap")
-        go_on.set()
+        time.sleep(0.3)
+        assert not any(answer.done() for answer in asked)  # which have half a second
         ended.result()
-        assert [answer.result()[0] for answer in asked] == [400, 503]
+        for name in ("busy", "idle"):
+            assert is_interrupted(tmp_path / f"{name}.mcap")
+        for answer in asked:
+            assert isinstance(answer.exception(), http.client.RemoteDisconnected)
+        go_on.set()
     loop.call_soon_threadsafe(loop.stop)
     running.join()
     assert len(begun) == 1
-    assert read_recording(tmp_path / "busy.mcap").ended.outcome == "interrupted"
+    assert is_interrupted(tmp_path / "busy.mcap")  # still
 
 
-def is_ended(path):
-    return read_recording(path, partial=True).ended is not None
+def is_interrupted(path):
+    """Whether a recording has ended so, with no result."""
+    recording = read_recording(path)
+    assert {verdict.outcome for verdict in verify(recording)} <= {NO_RESULT}
+    return recording.ended.outcome == "interrupted"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there is no such signal on Windows")
+def test_the_command_ends_within_a_second_during_a_long_registration(tmp_path):
+    command = [sys.executable, "-m", "runners.serve", "port=0", f"folder={tmp_path}"]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "CHSEL_TOKEN": TOKEN}
+    served = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    lines = iter(served.stdout.readline, "")
+    address = next(found[1] for line in lines if (found := re.search(r"http://([\d.:]+)", line)))
+    long = {"iterations": 100_000, "stop_below": None}
+    path = opened(address, record="long.mcap", method="icp", settings=long)
+    ask(address, f"{path}/add", contacts=ON_BOX)
+    with ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(ask, address, f"{path}/register", b"")
+        time.sleep(2.0)  # so that it is begun
+        assert not asked.done()
+        served.send_signal(signal.SIGTERM)
+        begun = time.monotonic()
+        assert served.wait() == 0
+        assert time.monotonic() - begun < 5.0  # minutes if the result is waited for
+        assert isinstance(asked.exception(), http.client.RemoteDisconnected | ConnectionError)
+    assert is_interrupted(tmp_path / "long.mcap")
 
 
 @pytest.mark.parametrize("kind", ["py", "cpp"])
