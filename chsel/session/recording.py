@@ -143,7 +143,8 @@ class SessionRecorder(Recorder):
     """Hands events to another recorder, each checked as soon as it comes.
 
     Where that recorder fails, as on a full disk, the next `flush` or `close` raises its error,
-    once. What follows is not recorded, so that the session can go on; nor is what follows `end`.
+    once. What follows is not recorded, so that the session can go on. Events that follow `end` are
+    errors, so that a registration of another thread ends there.
     """
 
     def __init__(self, recorder: Recorder, advice: str = "") -> None:
@@ -156,7 +157,9 @@ class SessionRecorder(Recorder):
 
     def check(self, event: Event) -> None:
         """Raise RecordingError for an event that cannot be recorded."""
-        if not self._failed and not self._ended:
+        if self._ended:
+            raise RecordingError("the recording has ended; accepted: no more events")
+        if not self._failed:
             self._recorder.check(event)
 
     def record(self, event: Event) -> None:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import secrets
+import sys
+import threading
 import traceback
 import zlib
 from collections.abc import Awaitable, Callable
@@ -21,7 +24,9 @@ from replay.console import print_error
 from runners.serving import messages
 
 MOST_BYTES = 256 * 2**20  # of a request
-PATIENCE = 0.5  # seconds that requests have to finish once the server ends
+PATIENCE = 0.25  # seconds that requests have to finish once the server ends
+_AT_ONCE = 8  # recordings that end, as each waits for the disk
+_LEAST_PRIORITY = 19  # of a thread in Linux
 _LONGEST_LINE = 2**16  # bytes, so that a long name is answered as others are
 _WITH_HEADER = 32 + zlib.MAX_WBITS  # of zlib: that of gzip or of deflate
 _LOGGER = logging.getLogger(__name__)  # of aiohttp, about what clients do wrong
@@ -33,7 +38,13 @@ class _Served(NamedTuple):
 
     session: Session
     thread: ThreadPoolExecutor
+    thread_id: int  # of the system
     about: messages.Json
+
+    def yield_processor(self) -> None:
+        """Let all other threads go first, where threads have priorities of their own."""
+        if sys.platform == "linux":
+            os.setpriority(os.PRIO_PROCESS, self.thread_id, _LEAST_PRIORITY)
 
 
 class Server:
@@ -99,7 +110,9 @@ class Server:
         session, about = messages.open_session(body, self._folder)
         self._count += 1
         about = {"session": str(self._count), **about}
-        self._served[about["session"]] = _Served(session, ThreadPoolExecutor(1), about=about)
+        thread = ThreadPoolExecutor(1)
+        thread_id = thread.submit(threading.get_native_id).result()
+        self._served[about["session"]] = _Served(session, thread, thread_id=thread_id, about=about)
         return about
 
     async def _ask(self, request: web.Request) -> Any:
@@ -142,15 +155,18 @@ class Server:
         if not closing:
             return
         done, computing = await asyncio.wait(closing, timeout=PATIENCE)
-        for ended in done:
+        self.is_computing = self.is_computing or bool(computing)
+        for waiting in computing:
+            closing[waiting].yield_processor()
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
+            interrupted = [
+                asyncio.ensure_future(_in_thread(pool, closing[waiting].session.interrupt))
+                for waiting in computing
+            ]
+            await asyncio.gather(*interrupted, return_exceptions=True)
+        for ended in [*done, *interrupted]:
             error = ended.exception()
             if error is not None:
-                print_error(one_line(error))
-        for waiting in computing:
-            self.is_computing = True
-            try:
-                closing[waiting].session.interrupt()
-            except ChselError as error:
                 print_error(one_line(error))
 
 
