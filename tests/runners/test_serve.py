@@ -442,7 +442,8 @@ def test_the_command_ends_within_a_second_during_a_long_registration(tmp_path):
         begun = time.monotonic()
         assert served.wait() == 0
         assert time.monotonic() - begun < 5.0  # minutes if the result is waited for
-        assert isinstance(asked.exception(), http.client.RemoteDisconnected | ConnectionError)
+        cut = isinstance(asked.exception(), http.client.RemoteDisconnected | ConnectionError)
+        assert cut or asked.result()[0] == 400  # where the registration noticed in time
     assert is_interrupted(tmp_path / "long.mcap")
 
 
