@@ -81,7 +81,7 @@ PROBES = _schema(
     (_NUMBER, "hit_forecast forecast_spread surprise seconds decision_seconds"),
     (_COUNT, "hypotheses poses"),
     (_NUMBER, "error best_error belief_error spread promised middle_50 middle_90 grasp_chance"),
-    (_FLAG, "grasp_works"),
+    (_FLAG, "modes_90 grasp_works"),
     (_TEXT, "verdict stop digest problem_digest decision_digest"),
 )
 """A row a (configuration, seed, policy, probe). Lengths in metres, surprise in nats. probes: how
@@ -92,7 +92,8 @@ last registration; before there is one, belief_error, the same of the belief's p
 weights. best_error: the same of the best hypothesis. verdict: how far to trust the registration of
 this probe. poses: how many these are. spread: of the belief. promised: by how much the best action
 would narrow it. middle_50, middle_90: in which share of the three directions along which members of
-a registration's belief spread the most the middle 50 and 90 % of them have the true pose.
+a registration's belief spread the most the middle 50 and 90 % of them have the true pose. modes_90:
+whether the ellipsoid of 90 % of one of its modes, widened, has it; null without modes.
 grasp_chance: of the best of 40 grasps drawn at members; grasp_works: whether it does. stop: why a
 session with the usual rules would end here, "" if it goes on."""
 TABLES = {"results": RESULTS, "iterations": ITERATIONS, "probes": PROBES}

@@ -7,14 +7,24 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.stats import chi2
 
-from chsel.belief import Gripper, PoseBelief, grasps_work, pose_offsets
+from chsel.belief import Gripper, Mode, PoseBelief, grasps_work, pose_offsets
 from chsel.next_probe.decision_problem import Decision, WeightedPoses
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.symmetry import symmetry_of
 from chsel.policies.policy import PolicySettings, StopSettings
 from chsel.problem import surface
-from chsel.problem.poses import Poses, compose, inverse, random_rotations, rotated
+from chsel.problem.object_symmetry import ObjectSymmetry
+from chsel.problem.poses import (
+    Poses,
+    compose,
+    inverse,
+    product,
+    random_rotations,
+    rotated,
+    rotation_vectors,
+)
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import Purpose, StreamKey, uniforms
 from chsel.session.rehearsal import warm_up, warm_up_policy
@@ -28,6 +38,7 @@ from runners.run.session_run import steps
 from runners.run.setup import RunSetup, open_setup, session_started
 
 _GRASPS = 40  # that a belief is asked about
+_SHARE = 0.9  # of the ellipsoids of modes
 _MIDDLES = {"middle_50": 0.25, "middle_90": 0.05}  # of the members: where they begin
 _WIDEST = 3  # directions
 
@@ -157,6 +168,11 @@ def belief_numbers(
     for name, first in _MIDDLES.items():
         lower, upper = np.quantile(along, [first, 1.0 - first], axis=0)
         row[name] = float(((lower <= true) & (true <= upper)).mean())
+    if belief.modes:
+        squares = [
+            mode_distance(mode, world_from_object, symmetry=symmetry) for mode in belief.modes
+        ]
+        row["modes_90"] = bool(min(squares) <= chi2.ppf(_SHARE, df=6))
     stream = key.stream(Purpose.GRASPS)
     drawn = inverse(members[uniforms(stream, 0, upper=len(members), shape=_GRASPS).astype(int)])
     lower, upper = mesh.bounds
@@ -173,6 +189,21 @@ def belief_numbers(
         sdf, there, world_from_gripper=grasps[[best]], width=gripper.opening, gripper=gripper
     )
     return row | {"grasp_chance": float(chance[best]), "grasp_works": bool(works[0, 0])}
+
+
+def mode_distance(mode: Mode, world_from_object: FloatArray, *, symmetry: ObjectSymmetry) -> float:
+    """Return the squared Mahalanobis distance of a pose (4, 4) from a mode, as a planner has both.
+
+    By the covariance about the origin of the object's frame, of the copy by the object's symmetries
+    that is nearest to the mode.
+    """
+    found = Poses.of(inverse(world_from_object)[None])
+    near = symmetry.nearest_copies(found, Poses.of(mode.object_from_world[None]))
+    off = near.world_from_object[0]
+    own = mode.world_from_object
+    turn = rotation_vectors(product(off[:3, :3], own[:3, :3].T)[None])[0]
+    vector = np.concatenate([off[:3, 3] - own[:3, 3], turn])
+    return float(vector @ np.linalg.solve(mode.pose_covariance, vector))
 
 
 def spread_of(sdf: SdfGrid, belief: WeightedPoses) -> float:

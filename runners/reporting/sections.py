@@ -535,22 +535,41 @@ def _tenths(
 
 
 def _belief_tables(sessions: SteeredSessions) -> list[Table]:
-    """Return how often the middle of the members has the true pose, and how often grasps work."""
+    """Return how often beliefs have the true pose, by how hard that is, and grasps work."""
     rows = sessions.rows[sessions.rows["grasp_chance"].notna()]
-    lines = []
-    for first, last in _CONTACTS:
-        own = rows[rows["contacts"].between(first, last)]
-        if len(own):
-            line = {"contacts": f"{first} to {last}", "registrations": len(own)}
-            line |= {name: percent(own[column].mean()) for column, name in _MIDDLES.items()}
-            line["best grasp said to work"] = percent(own["grasp_chance"].mean())
-            lines.append(line | {"works": _share(own["grasp_works"])})
+    by_contacts = {
+        f"{first} to {last}": rows[rows["contacts"].between(first, last)]
+        for first, last in _CONTACTS
+    }
+    contacts = [
+        {"contacts": name, **_belief_cells(own)} for name, own in by_contacts.items() if len(own)
+    ]
+    quarters = pd.qcut(_MM * rows["spread"], 4, duplicates="drop")
+    spreads = [
+        {"spread, mm": f"{quarter.left:.1f} to {quarter.right:.1f}", **_belief_cells(own)}
+        for quarter, own in rows.groupby(quarters, observed=True)
+    ]
     bins = _tenths(rows, "grasp_chance", happened="grasp_works", counted="grasps")
-    note = "The true pose along the three directions in which members spread the most."
+    note = (
+        "The true pose along the three directions in which members spread the most, and in the "
+        "widened ellipsoid of 90 % of a mode, where a result has modes."
+    )
     return [
-        table_of("Beliefs by the number of contacts", lines, note=note),
+        table_of("Beliefs by the number of contacts", contacts, note=note),
+        table_of("Beliefs by quarter of their spread", spreads, note=note),
         table_of("Grasps by the chance that they work", bins),
     ]
+
+
+def _belief_cells(rows: pd.DataFrame) -> dict[str, Any]:
+    """Return what the beliefs of some registrations say, and what is true."""
+    cells: dict[str, Any] = {"registrations": len(rows)}
+    cells |= {name: percent(rows[column].mean()) for column, name in _MIDDLES.items()}
+    held = rows["modes_90"].dropna()
+    cells["with modes"] = len(held)
+    cells["in a mode's 90 %"] = _share(held)
+    cells["best grasp said to work"] = percent(rows["grasp_chance"].mean())
+    return cells | {"works": _share(rows["grasp_works"])}
 
 
 def _stops_table(sessions: SteeredSessions, styles: Styles) -> Table:

@@ -7,11 +7,13 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 import trimesh
+from scipy.stats import chi2
 
 from chsel.belief import PoseBelief
 from chsel.errors import SettingError
 from chsel.methods.anchored.anchored import Anchored
-from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
+from chsel.problem.object_symmetry import ObjectSymmetry
+from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, rotation_vector
 from chsel.problem.registration_problem import Hypotheses, Trust
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
@@ -21,7 +23,7 @@ from runners import evaluate, probe
 from runners.evaluation.contenders import chosen_policies
 from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.plan import Task, Trial
-from runners.evaluation.run_policy import belief_numbers, spread_of, usual_stop
+from runners.evaluation.run_policy import belief_numbers, mode_distance, spread_of, usual_stop
 from tests.runners.in_process import do_task, run
 from tests.runners.test_evaluate import stamps
 from tests.runners.test_evaluation import plan_in
@@ -130,18 +132,18 @@ def test_the_usual_rules_stop_at_a_narrow_belief_or_where_little_is_promised():
     )
 
 
-def believed(sdf, world_from_object):
-    """The belief of members at these poses (K, 4, 4)."""
+def believed(sdf, world_from_object, *, modes=0):
+    """The belief of members at these poses (K, 4, 4); the first so many are those of modes."""
     count = len(world_from_object)
     trust = Trust(
         noise=0.001,
         outliers=0.0,
         misfit=0.5,
-        modes=0,
+        modes=modes,
         spread=0.01,
-        verdict="wide",
+        verdict="several modes" if modes else "wide",
         redundancy=6,
-        best_of_modes=(),
+        best_of_modes=tuple(range(modes)),
     )
     found = Hypotheses(
         inverse(world_from_object),
@@ -174,6 +176,27 @@ def test_the_middle_of_the_members_has_the_true_pose_or_not():
             believed(sdf, members), mesh, sdf=sdf, world_from_object=truth, key=key
         )
         assert (row["middle_50"], row["middle_90"]) == pytest.approx(middles)
+
+
+def test_an_ellipsoid_of_90_percent_holds_what_a_normal_distribution_does():
+    """Of poses of a normal distribution 90 % are in that of the mode that it is widened to be."""
+    mesh = trimesh.creation.box([0.05, 0.06, 0.07])
+    mesh.apply_translation([0.06, -0.04, 0.02])  # so that origin and centre differ
+    sdf = SdfGrid.from_mesh(mesh, 0.005)
+    random = np.random.default_rng(3)
+    around = compose(rotation_vector(np.array([[0.5, 1.0, -0.7]]))[0], np.array([0.2, 0.4, 0.1]))
+    (mode,) = believed(sdf, around[None], modes=1).modes
+    lower = np.linalg.cholesky(mode.wide_covariance)
+    off = random.standard_normal((4000, 6)) @ lower.T
+    centre = mesh.bounds.mean(axis=0)
+    turned = rotation_vector(off[:, 3:]) @ around[:3, :3]
+    centres = around[:3, :3] @ centre + around[:3, 3] + off[:, :3]
+    poses = compose(turned, centres - turned @ centre)
+    symmetry = ObjectSymmetry(centre=centre)
+    squares = np.array([mode_distance(mode, pose, symmetry=symmetry) for pose in poses])
+    assert (squares <= chi2.ppf(0.9, 6)).mean() == pytest.approx(0.9, abs=0.015)
+    in_centre = np.linalg.solve(lower, off.T).T
+    np.testing.assert_allclose(squares, (in_centre**2).sum(axis=1), rtol=0.2)
 
 
 def test_turns_count_by_how_far_they_move_the_surface():

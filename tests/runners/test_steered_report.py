@@ -34,6 +34,7 @@ def rows():
     forecasts = {"hit_forecast": [1.0, 0.85, 0.15, 0.85], "hit": [True, True, False, False]}
     forecasts |= {"grasp_chance": [None, 0.75, 0.72, 1.0], "grasp_works": [None, False, True, True]}
     forecasts |= {"middle_50": [None, 1 / 3, 1.0, 0.0], "middle_90": [None, 2 / 3, 1.0, 1.0]}
+    forecasts |= {"modes_90": [None, None, False, True]}
     return [
         *session("can", 20, policy="information", errors=[80.0, 8.0, 4.0, 2.0], **forecasts),
         *session("can", 20, policy="grid", errors=[80.0, 40.0, 20.0, 10.0]),
@@ -152,7 +153,11 @@ def test_tables_have_the_numbers_of_the_sessions(tmp_path, rows):
         ["90 to 100 %", "1", "100 %", "100 % [21, 100]"],
     ]
     beliefs = tables["Beliefs by the number of contacts"]
-    assert beliefs[1:] == [["1 to 4", "3", "44.4 %", "88.9 %", "82.3 %", "67 % [21, 94]"]]
+    held = ["44.4 %", "88.9 %", "2", "50 % [9, 91]", "82.3 %", "67 % [21, 94]"]
+    assert beliefs[1:] == [["1 to 4", "3", *held]]
+    spreads = tables["Beliefs by quarter of their spread"]
+    quarters = [line[:2] for line in spreads[1:]]  # of 2, 4 and 8 mm
+    assert quarters == [["2.0 to 3.0", "1"], ["3.0 to 4.0", "1"], ["6.0 to 8.0", "1"]]
     assert tables["Grasps by the chance that they work"][1:] == [
         ["70 to 80 %", "2", "74 %", "50 % [9, 91]"],
         ["90 to 100 %", "1", "100 %", "100 % [21, 100]"],
@@ -170,7 +175,7 @@ def test_tables_have_the_numbers_of_the_sessions(tmp_path, rows):
 
 def test_a_table_of_before_beliefs_were_measured_is_read(tmp_path, rows):
     folder = write_sessions(tmp_path, rows, budgets=BUDGETS)
-    columns = ["middle_50", "middle_90", "grasp_chance", "grasp_works"]
+    columns = ["middle_50", "middle_90", "modes_90", "grasp_chance", "grasp_works"]
     table = pyarrow.parquet.read_table(folder / "probes.parquet").drop_columns(columns)
     pyarrow.parquet.write_table(table, folder / "probes.parquet")
     tables = tables_of(folder)
