@@ -124,6 +124,8 @@ class Probe:
     # (4, 4): the true pose after the probe, where that moved the object and it is known.
     world_from_object: FloatArray | None = None
     image_points: int = 0  # so many of the new known points, the last, are of an image
+    # (W,), ascending: which of the points known before are not of the object after all.
+    withdrawn: IntArray | None = None
 
     @property
     def push(self) -> FloatArray | None:
@@ -136,6 +138,14 @@ class Probe:
         x, y, _ = self.gripper_path[-1, :3, 2].tolist()
         length = math.sqrt(x * x + y * y)
         return np.array([x, y, 0.0]) / length if length > _LEAST_SIDEWAYS else None
+
+    def added_to(self, points: KnownPoints) -> KnownPoints:
+        """Return all points that are known with this probe, by those that are known before it."""
+        if self.withdrawn is not None:
+            kept = np.ones(len(points.known), dtype=bool)
+            kept[self.withdrawn] = False
+            points = points.with_known(kept)
+        return points.merged(self.new_points)
 
 
 @dataclass(frozen=True, eq=False)

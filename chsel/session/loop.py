@@ -171,7 +171,7 @@ class Loop:
         """
         require_parts(points=probe.new_points)
         state = self.state
-        points = state.points.merged(probe.new_points)
+        points = probe.added_to(state.points)
         pushes = state.pushes
         if probe.push is not None:
             before = tuple(len(getattr(points, name)) for name in POINT_CLASSES)

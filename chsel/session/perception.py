@@ -9,9 +9,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from chsel.errors import InputWarning, MeshError, PointsError, PoseError, require_instance
+from chsel.errors import (
+    InputWarning,
+    MeshError,
+    PointsError,
+    PoseError,
+    quoted,
+    require_instance,
+)
 from chsel.events import Probe, SensorImage, SessionStarted
-from chsel.numerics.arrays import BoolArray, FloatArray, evenly_spaced, frozen
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, evenly_spaced, frozen
 from chsel.problem.points import (
     FARTHEST_PLACE,
     KnownPoints,
@@ -54,6 +61,7 @@ class Perception(NamedTuple):
     look: DepthLook | None
     seen: KnownPoints  # points on the object that the look gives, with their normals
     spacing: float  # of these points, metres
+    withdrawn: IntArray  # (W,), ascending: which known points are not of the object after all
 
     @property
     def touching(self) -> KnownPoints:
@@ -82,6 +90,7 @@ class Prepared(NamedTuple):
     perception: Perception
     probe: Probe  # but for the points that become free
     image: SensorImage | None
+    since: KnownPoints  # on the object, since it was pushed last, without what is withdrawn
     touching: KnownPoints  # without places that were measured before
     seen: FloatArray  # (M, 3): points on the object in the image, without such places
     warnings: list[InputWarning]
@@ -116,8 +125,23 @@ class Intake:
         spacing = started.free_resolution
         perception = perceived(**what, diameter=self.diameter, spacing=spacing)
         look = perception.look
+        since = self._since
+        withdrawn = None
+        if len(perception.withdrawn):
+            withdrawn = perception.withdrawn
+            if self._moves:
+                raise PointsError(
+                    "withdraw is given, and touches may move the object; accepted: moves=0"
+                )
+            if withdrawn[-1] >= len(points.known):
+                raise PointsError(
+                    f"withdraw has {withdrawn[-1]}; accepted: numbers of session.points.known, "
+                    f"below {len(points.known)}"
+                )
+            since = since.with_known(~_are_among(since.known, points.known[withdrawn]))
+            points = Probe(step, "points", KnownPoints(), withdrawn=withdrawn).added_to(points)
         touching, found = distinct_points(
-            perception.touching, self._since, apart=same_place(self.diameter)
+            perception.touching, since, apart=same_place(self.diameter)
         )
         places = perception.seen.known
         seen = perception.seen.with_known(away_from(places, self._seen, apart=perception.spacing))
@@ -136,7 +160,7 @@ class Intake:
         outcome = "free"
         if len(perception.touched.known):
             outcome = "contact"
-        elif perception.others.count:
+        elif perception.others.count or withdrawn is not None:
             outcome = "points"
         probe = Probe(
             step=step,
@@ -146,6 +170,7 @@ class Intake:
             contacts=perception.touched.known,
             contact_normals=perception.touched.normals,
             image_points=len(seen.known),
+            withdrawn=withdrawn,
         )
         image = None
         if look is not None:
@@ -158,6 +183,7 @@ class Intake:
             perception=perception._replace(look=look),
             probe=probe,
             image=image,
+            since=since,
             touching=touching,
             seen=seen.known,
             warnings=[*found, *perception.check(started.sdf.diameter, given_workspace)],
@@ -184,15 +210,15 @@ class Intake:
         known = KnownPoints(free=free[~doubtful]).merged(prepared.probe.new_points)
         probe = replace(prepared.probe, new_points=known)
         self._seen = np.concatenate([self._seen, prepared.seen])
-        self._since = self._since.merged(prepared.touching)
+        self._since = prepared.since.merged(prepared.touching)
         if self._moves and probe.push is not None:  # what was known has moved with the object
             self._forget()
         return [probe] if prepared.image is None else [prepared.image, probe]
 
-    def retake(self, started: SessionStarted, probe: Probe) -> None:
+    def retake(self, started: SessionStarted, probe: Probe, *, before: KnownPoints) -> None:
         """Take a probe that a session before this one has recorded.
 
-        started: its start, with the workspace.
+        started: its start, with the workspace. before: all points known before the probe.
         """
         self._started = started
         if self._grid is None:
@@ -200,6 +226,9 @@ class Intake:
             self._grid.at(started.initial_points.free)
         self._grid.at(probe.new_points.free)
         self._grid.new()
+        if probe.withdrawn is not None:
+            gone = before.known[probe.withdrawn]
+            self._since = self._since.with_known(~_are_among(self._since.known, gone))
         known = np.arange(len(probe.new_points.known))
         touched = known < len(known) - probe.image_points
         on_object = replace(probe.new_points, free=np.zeros((0, 3)))
@@ -213,6 +242,25 @@ class Intake:
         self._grid = FreeGrid(self._started.workspace, self._started.free_resolution)
         self._seen = np.zeros((0, 3))
         self._since = KnownPoints()
+
+
+def _numbers(withdraw: Any) -> IntArray:
+    """Return the numbers of points (W,) to withdraw, ascending; none for None."""
+    if withdraw is None:
+        return np.zeros(0, dtype=np.int64)
+    given = frozen("withdraw", withdraw, shape=(None,))
+    numbers = np.unique(given).astype(np.int64)
+    if len(numbers) < len(given) or not np.isin(given, numbers).all() or (numbers < 0).any():
+        raise PointsError(
+            f"withdraw is {quoted(np.asarray(withdraw).tolist())}; accepted: numbers of points, "
+            "each once"
+        )
+    return numbers
+
+
+def _are_among(points: FloatArray, some: FloatArray) -> BoolArray:
+    """Return which of points (N, 3) are one of others (W, 3)."""
+    return np.asarray((points[:, None] == some).all(axis=2).any(axis=1))
 
 
 def known_points(
@@ -296,6 +344,7 @@ def perceived(
     world_from_camera: Any = None,
     mask: Any = None,
     image_normal_noise: Any = None,
+    withdraw: Any = None,
     surface: Any = None,
     diameter: float,
     spacing: float,
@@ -313,7 +362,8 @@ def perceived(
         contact=contact,
         normal=normal,
     )
-    if all(each is None for each in (contacts, free, occupied, known, path, contact, depth)):
+    given = (contacts, free, occupied, known, path, contact, depth, withdraw)
+    if all(each is None for each in given):
         raise PointsError("nothing was added; accepted: points, a path or a depth image")
     if (hand is None) is not (path is None):
         raise PointsError("hand and path belong together; accepted: both or none")
@@ -364,6 +414,7 @@ def perceived(
         swept=swept,
         look=look,
         seen=seen,
+        withdrawn=_numbers(withdraw),
         spacing=side,
     )
 

@@ -59,8 +59,9 @@ def retraced(
         match event:
             case Probe():
                 waiting = []
+                before = run.loop.state.points
                 run.observe(event)
-                intake.retake(run.started, event)
+                intake.retake(run.started, event, before=before)
             case ActionsOffered():
                 run.offer(event.actions, event.hand)
                 taken = set()

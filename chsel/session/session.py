@@ -428,6 +428,7 @@ class Session:
         world_from_camera: Any = None,
         mask: Any = None,
         image_normal_noise: Any = None,
+        withdraw: Any = None,
         surface: Any = None,
     ) -> None:
         """Add what became known; it is in the recording when this returns.
@@ -444,6 +445,8 @@ class Session:
         before what they see. mask (H, W): the object's pixels, which give points on it.
         image_normal_noise: root mean square angle by which normals of the image are off, radians;
         its points then have normals where their pixel is on no edge.
+        withdraw (W,): numbers of points of `points.known` that are not the object's after all, such
+        as touches of another one.
         Raises ChselError for malformed input and for what cannot be recorded, with nothing added;
         RecordingError once, with everything added, where the recording cannot be written any more.
         """
@@ -464,6 +467,7 @@ class Session:
             world_from_camera=world_from_camera,
             mask=mask,
             image_normal_noise=image_normal_noise,
+            withdraw=withdraw,
             surface=surface,
         )
         self.commit(prepared)

@@ -126,7 +126,17 @@ class EventReader:
             normal_noise=values["normal_noise"],
         )
         counts = {name: len(getattr(points, name)) for name in POINT_CLASSES}
-        before = self._counts or {name: values[name] - counts[name] for name in counts}
+        before = {name: values[name] - counts[name] for name in counts}
+        withdrawn = self._opening.get("withdrawn")
+        if self._counts is not None:
+            before = dict(self._counts)
+            if withdrawn is not None:
+                if withdrawn[-1] >= before["known"]:
+                    raise RecordingError(
+                        f"step {values['step']} withdraws point {withdrawn[-1]}; accepted: below "
+                        f"{before['known']}"
+                    )
+                before["known"] -= len(withdrawn)
         self._counts = {name: before[name] + count for name, count in counts.items()}
         for name, count in counts.items():
             if (count, self._counts[name]) != (values[f"new_{name}"], values[name]):

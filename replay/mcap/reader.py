@@ -80,7 +80,7 @@ class Recording:
         offered = self.offered
         for entry in self._entries:
             if isinstance(entry, Probe):
-                points = points.merged(entry.new_points)
+                points = entry.added_to(points)
             if isinstance(entry, ActionsOffered):
                 offered = entry
             if isinstance(entry, RecordedProblem):
@@ -190,7 +190,7 @@ class Recording:
         points = self.start.initial_points
         for entry in self._entries:
             if isinstance(entry, Probe):
-                points = points.merged(entry.new_points)
+                points = entry.added_to(points)
             if isinstance(entry, kind) and entry.step == step:
                 break
         assert isinstance(entry, kind)

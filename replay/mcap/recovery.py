@@ -209,7 +209,7 @@ class _Recovery:
             case ActionsOffered():
                 self._offered = event
             case Probe():
-                self._points = self._points.merged(event.new_points)
+                self._points = event.added_to(self._points)
                 self.found.probes.append(event.step)
             case ProblemPosed():
                 self.found.problems.append(event.step)

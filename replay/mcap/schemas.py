@@ -23,6 +23,7 @@ from replay.mcap.validation import (
     finite,
     intrinsics,
     not_empty,
+    numbers_of_points,
     one_of,
     plain_texts,
     positive,
@@ -106,6 +107,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "contact_normals": ("f8[C,3]", finite),
         "world_from_object": ("f8[4,4]?", rigid),
         "image_points": "uint32",
+        "withdrawn": ("i8[W]?", numbers_of_points),
     },
     # Closes a session's start and every probe, after the point clouds that it counts.
     "KnownPoints": {

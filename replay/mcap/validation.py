@@ -159,6 +159,13 @@ def ascending_costs(field: str, value: np.ndarray) -> None:
         raise RecordingError(f"{field} is -inf; accepted: finite numbers, or inf")
 
 
+def numbers_of_points(field: str, value: np.ndarray) -> None:
+    """Accept numbers (W,) of points, from 0, ascending, at least one."""
+    not_empty(field, value)
+    if value[0] < 0 or not (value[:-1] < value[1:]).all():
+        raise RecordingError(f"{field} is out of order; accepted: ascending numbers, from 0")
+
+
 def check_mesh(vertices: np.ndarray, faces: np.ndarray) -> None:
     """Raise RecordingError unless vertices (V, 3) are finite and faces (F, 3) are of them."""
     if len(faces) == 0:

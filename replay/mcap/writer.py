@@ -135,7 +135,8 @@ class McapRecorder(Recorder):
                 self._write_session(event)
             case Probe():
                 self._record(event.topic, event.step, values=event_values(event))
-                self._write_points(event.step, event.new_points)
+                assert self._points is not None
+                self._write_points(event.step, event.new_points, every=event.added_to(self._points))
             case ProblemPosed():
                 self._write_problem(event)
             case ActionsOffered():
@@ -163,17 +164,15 @@ class McapRecorder(Recorder):
         self._record(event.topic, event.step, values=values)
         for topic in STARTING_EMPTY:
             self._add(topic, event.step, make=empty_cloud)
-        self._points = KnownPoints()
-        self._write_points(event.step, event.initial_points)
+        self._write_points(event.step, event.initial_points, every=event.initial_points)
 
-    def _write_points(self, step: int, new: KnownPoints) -> None:
-        """Write new points, class by class, and then how many are known with them."""
-        assert self._points is not None
+    def _write_points(self, step: int, new: KnownPoints, *, every: KnownPoints) -> None:
+        """Write new points, class by class, and then how many are known with them, `every`."""
         known = np.column_stack([new.known, new.sdf])
         for topic, points in zip(CLOUDS, (new.free, new.occupied, known), strict=True):
             if len(points) > 0:
                 self._add(topic, step, make=partial(point_cloud, points))
-        self._points = self._points.merged(new)
+        self._points = every
         values: dict[str, Any] = {name: len(getattr(self._points, name)) for name in POINT_CLASSES}
         values |= {f"new_{name}": len(getattr(new, name)) for name in POINT_CLASSES}
         values |= {"step": step, "new_digest": new.digest}

@@ -135,7 +135,7 @@ def step_rows(recording: Recording) -> list[dict[str, Any]]:
     """
     points, rows = recording.start.initial_points, []
     for probe in recording.probes:
-        points = points.merged(probe.new_points)
+        points = probe.added_to(points)
         row: dict[str, Any] = {
             "step": probe.step,
             **{name: len(getattr(points, name)) for name in _POINTS},
