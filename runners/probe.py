@@ -6,7 +6,7 @@ import json
 import signal
 import sys
 from contextlib import ExitStack, nullcontext, suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import FrameType
 from typing import Self
@@ -36,6 +36,7 @@ from runners.run.session_run import Row, steps
 from runners.run.setup import GRID, ProbeConfig, RunSetup, open_setup, session_started
 from runners.sessions import kinds_of, source_kind
 from runners.sessions.physics_engine import with_engine
+from runners.sessions.recorded import RecordedSource
 from runners.sessions.source import ObjectOrigin
 
 
@@ -44,7 +45,8 @@ def main(config: DictConfig) -> None:
     """Run one session."""
     values = plain(config)
     values["session"] = with_engine(values["session"])
-    checked = build_settings(ProbeConfig, values, where="probe")
+    named = {"from_step" if name == "from" else name: value for name, value in values.items()}
+    checked = build_settings(ProbeConfig, named, where="probe")
     _require_used_settings(checked)
     method_config = dict(checked.method)
     kind = checked.session.get("kind")
@@ -72,6 +74,9 @@ def main(config: DictConfig) -> None:
         folder = make_run_folder(Path(checked.logs) / "probe", setup.object_name, method_name)
         write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
         started = session_started(checked, values, method_name=method_name, setup=setup)
+        if isinstance(setup.source, RecordedSource) and checked.from_step is not None:
+            setup.source.require_step(checked.from_step)
+            started = replace(started, start=None, source=setup.source.digest)
         with Interrupt() as interrupt:
             interrupted = run_session(
                 folder,
@@ -108,6 +113,9 @@ def _require_used_settings(config: ProbeConfig) -> None:
     if kind == "kinematic":
         reason, accepted = "a kinematic session has no physics engine", "session=simulated with it"
         require_used("session.engine", reason=reason, accepted=accepted)
+    if origin is not ObjectOrigin.RECORDED:
+        reason, accepted = "a session of its own begins at its start", "session=recorded with it"
+        require_used("from", reason=reason, accepted=accepted)
     if origin is ObjectOrigin.RECORDED:
         reason, accepted = "a recorded session brings its own object", "another session with it"
         require_used("object", "configuration", reason=reason, accepted=accepted)
@@ -187,6 +195,9 @@ def run_session(
         show=lambda *_: interrupt.check(),
     )
     setup.begin(run, started)
+    if config.from_step is not None:
+        assert isinstance(setup.source, RecordedSource)
+        setup.source.retrace(run, config.from_step)
     display.warn(setup.warnings)
     rows: list[Row] = []
     outcome = "finished"

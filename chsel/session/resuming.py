@@ -34,7 +34,7 @@ _OF_RESULTS = (ProblemPosed, Traced, SnapshotTaken, HypothesesFound, Measured, B
 
 def retraced(
     run: Run,
-    intake: Intake,
+    intake: Intake | None,
     *,
     events: Iterable[Event],
     step: int | None,
@@ -43,11 +43,11 @@ def retraced(
 ) -> set[int]:
     """Let a run that has begun come to where recorded events end; return the actions taken.
 
-    step: the last one; None: of all. with_results, with_decisions: whether those of the recording
-    count, as they do where method and policy are the same. What was recorded is recorded again. A
-    registration without a result does not count. The actions are those of the last that were
-    offered. Raise RecordingError where this version poses another problem, or finds another result
-    at the last step.
+    intake: of a program that adds more; None where probes come otherwise. step: the last one; None:
+    of all. with_results, with_decisions: whether those of the recording count, as they do where
+    method and policy are the same. What was recorded is recorded again. A registration without a
+    result does not count. The actions are those of the last that were offered. Raise RecordingError
+    where this version poses another problem, or finds another result at the last step.
     """
     taken: set[int] = set()
     waiting: list[Event] = []  # of a registration that has no result yet
@@ -61,7 +61,8 @@ def retraced(
                 waiting = []
                 before = run.loop.state.points
                 run.observe(event)
-                intake.retake(run.started, event, before=before)
+                if intake is not None:
+                    intake.retake(run.started, event, before=before)
             case ActionsOffered():
                 run.offer(event.actions, event.hand)
                 taken = set()

@@ -101,6 +101,7 @@ def probe_config(plan: Plan, trial: Trial, *, policy: Contender | None = None) -
         logs="",
         seed=trial.seed,
         threads=1,
+        from_step=None,
         configuration=trial.configuration,
     )
 

@@ -117,7 +117,7 @@ def _events(run: Run, source: ProbeSource) -> Iterator[ProbeEvent]:
         yield from source.probes()
         return
     assert isinstance(source, Steerable)
-    step = 0
+    step = run.step + 1
     while (chosen := _decided(run).decision.chosen) >= 0:
         yield from source.take(step, chosen)
         step += 1

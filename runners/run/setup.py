@@ -60,6 +60,7 @@ class ProbeConfig:
     seed: int
     threads: int
     configuration: str | None
+    from_step: int | None  # `from`, which is no name in Python
 
     def __post_init__(self) -> None:
         StreamKey(self.seed, 0)
@@ -185,6 +186,9 @@ def session_started(
         recorded.pop("policy", None)
     if config.grasp.path is None:
         recorded.pop("grasp", None)
+    if config.from_step is None:
+        for name in ("from", "from_step"):
+            recorded.pop(name, None)
     return SessionStarted(
         runner="probe",
         object=setup.object_name,

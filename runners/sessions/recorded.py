@@ -10,17 +10,21 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import PointsError, PoseError, SessionError, SettingError
-from chsel.events import Probe, SessionStarted, Start
+from chsel.events import ActionsOffered, Decided, Probe, SessionStarted, Start
 from chsel.next_probe.action_lattice import ActionSettings, straight_actions
 from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.initial_sets import OnlineSettings
-from chsel.problem.points import KnownPoints, Lattice, check_points
+from chsel.problem.points import Lattice, check_points
 from chsel.problem.poses import apply, nearest_rigid
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
 from chsel.sensing.free_space import interior_lattice, poses_between
 from chsel.session.loop import Loop
+from chsel.session.resuming import retraced
+from chsel.session.run import Run
+from replay.comparing.choices import recorded_method
+from replay.files import file_digest
 from replay.mcap.reader import read_recording
 from runners.objects.loader import ObjectModel
 from runners.sessions.probing import PROBING
@@ -65,8 +69,10 @@ class RecordedSource(Steerable):
         self._config: Mapping[str, Any] = start.config.get("session", {})
         self.push_distance = expected_moves(self._config) if start.moves is None else start.moves
         self.start = _start(settings, self._config)
-        new = [probe.new_points for probe in self._probes]
-        every = KnownPoints.joined([self.initial_points, *new])
+        self._after = -1  # the step after which probes are given
+        every = self.initial_points
+        for probe in self._probes:
+            every = probe.added_to(every)
         try:  # before any work; warnings are given when the points become known
             check_points(
                 every,
@@ -82,7 +88,46 @@ class RecordedSource(Steerable):
         for probe in self._probes:
             if probe.world_from_object is not None:
                 self.world_from_object = probe.world_from_object
-            yield probe
+            if probe.step > self._after:
+                yield probe
+
+    @property
+    def digest(self) -> str:
+        """Digest of the recording's file."""
+        return file_digest(self._recording.path)
+
+    def require_step(self, step: int) -> None:
+        """Raise SessionError unless the recording has a probe of this step."""
+        known = [probe.step for probe in self._probes]
+        if step not in known:
+            accepted = f"{known[0]} to {known[-1]}" if known else "none, as it has no probe"
+            raise SessionError(
+                f"recording {self._recording.path} has no step {step}; accepted: from={accepted}"
+            )
+
+    def retrace(self, run: Run, step: int) -> None:
+        """Let a run that has begun come to a step of the recording; probes after it are given.
+
+        With the method of the recording, with its settings, results of the recording count;
+        another one begins anew, with all points. Raise RecordingError where this version finds
+        other values than the recording has.
+        """
+        recorded = recorded_method(self._recording).build()
+        same = type(recorded) is type(run.method) and recorded.settings == run.method.settings
+        offered = (ActionsOffered, Decided)  # as this run has its own
+        retraced(
+            run,
+            None,
+            events=[one for one in self._recording.events() if not isinstance(one, offered)],
+            step=step,
+            with_results=same,
+            with_decisions=False,
+        )
+        self._after = step
+        if run.policy is not None:
+            for number, probe in enumerate(self._probes):
+                if probe.step <= step:
+                    self._actions.take(probe.step, number)
 
     @cached_property
     def hand(self) -> HandShape:
@@ -111,6 +156,11 @@ class RecordedSource(Steerable):
             raise SessionError(
                 f"recording {self._recording.path} has an object that moved, so that its probes "
                 "cannot be taken in another order; accepted: policy=grid"
+            )
+        if any(probe.withdrawn is not None for probe in self._probes):
+            raise SessionError(
+                f"recording {self._recording.path} has points that were withdrawn, so that its "
+                "probes cannot be taken in another order; accepted: policy=grid"
             )
         return self._actions.offer(settings)
 
