@@ -35,6 +35,8 @@ from .problem.registration_problem import RegistrationProblem as RegistrationPro
 from .problem.registration_problem import Trust as Trust
 from .problem.sdf_grid import SdfGrid as SdfGrid
 from .problem.trust import trust_in as trust_in
+from .scene import Scene as Scene
+from .scene import SceneObject as SceneObject
 from .sensing.depth_camera import PinholeCamera as PinholeCamera
 from .sensing.free_space import FreeGrid as FreeGrid
 from .sensing.free_space import interior_lattice as interior_lattice
@@ -46,6 +48,7 @@ from .sensing.trajectory import Trajectory as Trajectory
 from .sensing.trajectory import read_trajectory as read_trajectory
 from .session.judging import trust_by as trust_by
 from .session.loop import Loop as Loop
+from .session.pose_judgement import PoseJudgement as PoseJudgement
 from .session.session import NextProbe as NextProbe
 from .session.session import Session as Session
 from .which_object import Candidate as Candidate

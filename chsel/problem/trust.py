@@ -105,7 +105,7 @@ def trust_in(
     limit = max(share * sdf.diameter, _GRID_ERROR * sdf.resolution, LEAST_LEVELS * sensor_noise)
 
     apart = distances_apart(sdf, poses)
-    width = max(MOST_WIDTH * sdf.diameter, LEAST_LEVELS * sensor_noise)
+    width = mode_width(sdf, sensor_noise)
     gap = max(width, LEAST_GAP * noise.sigma)
     near = apart <= gap
     differ = turned(sdf, poses, pairs=near)
@@ -198,6 +198,11 @@ def _normal_cost(points: KnownPoints, noise: NoiseModel) -> float:
     return float(logs(ratios).max())
 
 
+def mode_width(sdf: SdfGrid, sensor_noise: float) -> float:
+    """Return how far apart poses of a mode are at most, metres. sensor_noise: metres."""
+    return max(MOST_WIDTH * sdf.diameter, LEAST_LEVELS * sensor_noise)
+
+
 def sure_within(sdf: SdfGrid, sensor_noise: float) -> float:
     """Return how far off a pose that is determined may be, metres. sensor_noise: metres."""
     return max(min(SURE_SHARE * sdf.diameter, SURE_WITHIN), LEAST_LEVELS * sensor_noise)
@@ -219,7 +224,7 @@ def fits_elsewhere(
     noise = noise_model(sensor_noise)
     limit = pose_energies(problem, best, noise=noise)[0] + LIMIT
     apart = distances_apart_from(problem.sdf, poses, other=best)
-    width = max(MOST_WIDTH * problem.sdf.diameter, LEAST_LEVELS * sensor_noise)
+    width = mode_width(problem.sdf, sensor_noise)
     return bool(((pose_energies(other, poses, noise=noise) <= limit) & (apart > width)).any())
 
 

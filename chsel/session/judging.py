@@ -70,7 +70,7 @@ def trust_by(
     trust = trust_in(carried, hypotheses, sensor_noise=noise, rivals=rivals)
     searched = isinstance(method, Anchored) and len(carried.points.known) >= MANY_CONTACTS
     if trust.verdict == DETERMINED and not searched:
-        found = _search(noise).minima(carried)
+        found = search_for(noise).minima(carried)
         rivals = found if rivals is None else Poses.joined([rivals, found])
         trust = trust_in(carried, hypotheses, sensor_noise=noise, rivals=rivals)
     if trust.verdict == DETERMINED and _fits_other_pushes(problem, hypotheses, noise=noise):
@@ -100,7 +100,7 @@ def _undeclared_copies(
     alike = turns_alike(sdf)
     counted = sdf.symmetry.rotation_errors(alike[:, :3, :3]) <= TURN
     copies = Poses.of(alike[~counted] @ hypotheses.object_from_world[0])
-    return _search(noise).fitted(problem, copies) if len(copies) else None
+    return search_for(noise).fitted(problem, copies) if len(copies) else None
 
 
 def check_normals(
@@ -125,7 +125,7 @@ def check_normals(
     if agree or pose_energies(problem, best, noise=model)[0] <= explained:
         return []
     flipped = replace(problem, points=replace(points, normals=-points.normals))
-    search = method if isinstance(method, Anchored) else _search(noise)
+    search = method if isinstance(method, Anchored) else search_for(noise)
     poses = [best, search.minima(flipped)]
     if search is not method:  # which may not have found the best pose with the normals as they are
         poses.append(search.minima(problem))
@@ -158,7 +158,7 @@ def unexpected_push(
         return 0.0
     if trust is None or trust.misfit <= _CLOSE:
         return 0.0
-    return _search(noise_of(method)).register(replace(problem, pushes=pushes)).push_distance
+    return search_for(noise_of(method)).register(replace(problem, pushes=pushes)).push_distance
 
 
 def _fits_other_pushes(
@@ -168,7 +168,7 @@ def _fits_other_pushes(
     if problem.pushes is None:
         return False
     carried = problem.carried(hypotheses.push_distance)
-    search = _search(noise)
+    search = search_for(noise)
     for distance in problem.pushes.distances:
         other = problem.carried(distance)
         if fits_elsewhere(
@@ -178,6 +178,6 @@ def _fits_other_pushes(
     return False
 
 
-def _search(noise: float) -> Anchored:
+def search_for(noise: float) -> Anchored:
     """Return a search for poses that explain the points, at a noise, metres."""
     return Anchored(AnchoredSettings(noise=noise))

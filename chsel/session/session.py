@@ -34,7 +34,7 @@ from chsel.methods import METHODS, MOST_NOISE, build_method, default_method, met
 from chsel.methods.method import Method
 from chsel.next_probe.action_lattice import ActionSettings, around_actions
 from chsel.next_probe.decision_problem import Actions, Decision, HandShape
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray, frozen
 from chsel.numerics.threads import require_ieee_arithmetic
 from chsel.policies import POLICIES, build_policy
 from chsel.policies.policy import Policy
@@ -48,6 +48,7 @@ from chsel.problem.points import (
 )
 from chsel.problem.pose_distances import with_symmetry
 from chsel.problem.pose_prior import PosePrior, require_prior
+from chsel.problem.poses import nearest_rigid
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.sdf_grid import COARSEST, FINEST, OBJECT_PADDING, object_grid
 from chsel.problem.streams import StreamKey
@@ -57,6 +58,7 @@ from chsel.session.arguments import mesh_and_name, mesh_argument, name_of, plain
 from chsel.session.judging import noise_of
 from chsel.session.loop import Phase
 from chsel.session.perception import Intake, Prepared, hand_bodies
+from chsel.session.pose_judgement import PoseJudgement, judged_pose
 from chsel.session.recording import one_line, printable
 from chsel.session.rehearsal import warm_up, warm_up_policy, warm_up_sensing
 from chsel.session.resuming import retraced
@@ -595,6 +597,19 @@ class Session:
             action=decision.chosen,
             decision=decision,
         )
+
+    @_locked
+    def judge(self, world_from_object: Any) -> PoseJudgement:
+        """Return what the points say of a pose (4, 4) of another estimator, after a result.
+
+        Raises PoseError for what is no pose, and where the last step has no result with a pose.
+        """
+        pose = frozen("world_from_object", world_from_object, shape=(4, 4), error=PoseError)
+        pose = nearest_rigid("world_from_object", pose[None])[0]
+        found = self._run.answer
+        if self.problem is None or found is None or found.trust is None:
+            raise PoseError("nothing is registered yet; accepted: a judgement after `register`")
+        return judged_pose(self.method, self.problem, hypotheses=found, world_from_object=pose)
 
     @_locked
     def check_moved(self, most: float = 0.02) -> float:

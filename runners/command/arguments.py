@@ -14,6 +14,7 @@ from chsel.errors import SettingError
 TRACEBACK = "--traceback"
 _FILES = {
     "align": ("file",),
+    "judge": ("file",),
     "bop": ("file",),
     "plausible": ("file", "steps"),
     "rank": ("dir",),
