@@ -25,7 +25,7 @@ from chsel.errors import PointsError, SettingError, quoted, require_choice
 from chsel.next_probe.decision_problem import Actions
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.initial_sets import posed_problem
-from chsel.problem.noise import EXTENT, SHARE, PosedNormals, noise_model, normal_factors
+from chsel.problem.noise import EXTENT, FREEDOMS, SHARE, PosedNormals, noise_model, normal_factors
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.pose_prior import PosePrior
 from chsel.problem.poses import Poses, apply
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 NOBODY = -1
 """The number of no object, of a contact on something else."""
 _FEWEST_GAINED = 1.0  # nats for which a contact changes to another object
+_FITS = 6.0  # nats: a contact that costs less is explained
 _ROUNDS = 3  # of assignments and poses in turn, at most
 _NEAR = 0.35  # of the diameter: deviation of contacts from their middle
 _OVERLAP = 0.004  # m: a depth inside of another object that is no surprise
@@ -74,7 +75,7 @@ class _Joint(NamedTuple):
 
     energy: float
     given: tuple[int, ...]  # (M,), the object of each contact, or NOBODY
-    chosen: dict[int, Poses]  # the pose (1, 12) of each object that has contacts
+    worst: float  # what the contact that fits worst costs, nats
 
 
 class Scene:
@@ -255,7 +256,10 @@ class Scene:
         return float(np.log(self._model.greatest(np.zeros(1))[0] * EXTENT / SHARE))
 
     def _solutions(self) -> Iterator[_Joint]:
-        """Yield what each start comes to, the assignment before first."""
+        """Yield what each start comes to, the assignment before first.
+
+        Where that explains more contacts of each object than a pose is free to fit, it stands.
+        """
         seen: set[tuple[int, ...]] = set()
         for start in self._starts():
             given = start
@@ -265,7 +269,13 @@ class Scene:
                 seen.add(given)
                 joint = self._best(given)
                 yield joint
+                if given == self._given == joint.given and self._stands(joint):
+                    return
                 given = joint.given
+
+    def _stands(self, joint: _Joint) -> bool:
+        fewest = min(joint.given.count(number) for number in range(len(self._names)))
+        return fewest > FREEDOMS and joint.worst < _FITS
 
     def _starts(self) -> Iterator[tuple[int, ...]]:
         """Yield assignments to begin with: that before, all on one object, and by place."""
@@ -316,8 +326,8 @@ class Scene:
         new[new == len(self._names)] = NOBODY
         overlap = self._overlaps(pools, chosen)
         energy = float(costs[new, every].sum()) + own + overlap
-        poses = {number: pools[number].poses[[at]] for number, at in chosen.items()}
-        return _Joint(energy, tuple(int(one) for one in new), poses)
+        worst = float(costs[new, every].max())
+        return _Joint(energy, tuple(int(one) for one in new), worst=worst)
 
     def _combination(self, pools: dict[int, _Pool], given: tuple[int, ...]) -> dict[int, int]:
         """Return the poses of least energy, by object: one after the other, the surest first."""
