@@ -4,9 +4,11 @@
 
 in nats: e is minus the logarithm of the density of contact c, on the object that assignment a gives
 it, or on none, by the model of `chsel.problem.noise`; f_i that of free space and of what is known
-beforehand of object i; g_i says that contacts of one object are near each other, within its size;
-and h_ij that no object is inside another. Poses X are those that the method finds for the contacts
-that an object has been given; assignments and poses are improved in turn, from several starts.
+beforehand of object i; g_i says that contacts of one object are near each other, within its size,
+and that its first six are fitted whatever they are, as a pose is free to do so: each costs what it
+narrows the poses by, ln(EXTENT / 1.5 mm). h_ij says that no object is inside another. Poses X are
+those that the method finds for the contacts that an object has been given; assignments and poses
+are improved in turn, from several starts.
 """
 
 from __future__ import annotations
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
 NOBODY = -1
 """The number of no object, of a contact on something else."""
 _FEWEST_GAINED = 1.0  # nats for which a contact changes to another object
+_FITTED = 4.6  # nats, of each of the first six contacts of an object
 _FITS = 6.0  # nats: a contact that costs less is explained
 _ROUNDS = 3  # of assignments and poses in turn, at most
 _NEAR = 0.35  # of the diameter: deviation of contacts from their middle
@@ -166,14 +169,17 @@ class Scene:
             others = any(value is not None for value in what.values())
             if not others and len(touched.known) == 0:
                 raise PointsError("nothing was added; accepted: points, a path or a depth image")
-            before = len(self._given)
+            given = self._likeliest(touched)
+            with ExitStack() as taken:
+                prepared = []
+                for number, session in enumerate(self.sessions.values()):
+                    own = _arguments(touched.with_known(given == number))
+                    if others or own:
+                        prepared.append((session, session.prepare(**what, **own)))
+                for session, one in prepared:
+                    taken.callback(session.commit, one)  # all of them, whatever one raises
             self._touched = self._touched.merged(touched)
-            given = [self._likeliest(n) for n in range(before, len(self._touched.known))]
-            self._given = (*self._given, *given)
-            for number, session in enumerate(self.sessions.values()):
-                own = np.flatnonzero(np.array(given, dtype=int) == number) + before
-                if others or len(own):
-                    session.add(**what, **self._contacts(own))
+            self._given = (*self._given, *given.tolist())
 
     def register(self) -> dict[str, SceneObject]:
         """Give every contact to an object, and register each that has any, see `objects`."""
@@ -214,27 +220,20 @@ class Scene:
     def __exit__(self, *error: Any) -> None:
         self._open.__exit__(*error)
 
-    def _likeliest(self, contact: int) -> int:
-        """Return the object that a new contact fits best by the last results; NOBODY without."""
-        found = {}
+    def _likeliest(self, touched: KnownPoints) -> IntArray:
+        """Return the objects (M,) that new contacts fit best by the last results; NOBODY without.
+
+        NOBODY is the last row of costs, too.
+        """
+        costs = np.full((len(self._names) + 1, len(touched.known)), np.inf)
+        costs[NOBODY] = self._of_nobody
         for number, name in enumerate(self._names):
             one = self.objects.get(name)
             if one is not None and one.answer is not None:
                 poses = Poses.of(one.answer.object_from_world)
-                costs = self._costs(number, poses, contacts=self._touched.with_known([contact]))
-                found[number] = float(costs.min())
-        likeliest = min(found, key=lambda number: found[number], default=NOBODY)
-        return likeliest if found and found[likeliest] < self._of_nobody else NOBODY
-
-    def _contacts(self, numbers: IntArray) -> dict[str, Any]:
-        """Return contacts by their numbers as `Session.add` takes them."""
-        if len(numbers) == 0:
-            return {}
-        chosen = self._touched.with_known(numbers)
-        if not chosen.has_normals:
-            return {"contacts": chosen.known}
-        noise = chosen.normal_noise
-        return {"contacts": chosen.known, "normals": chosen.normals, "normal_noise": noise}
+                costs[number] = self._costs(number, poses, contacts=touched).min(axis=0)
+        likeliest = costs.argmin(axis=0)
+        return np.where(likeliest == len(self._names), NOBODY, likeliest)
 
     def _give(self, given: tuple[int, ...]) -> None:
         """Let sessions have the contacts that are theirs, and no others."""
@@ -243,7 +242,7 @@ class Scene:
             before = np.flatnonzero(np.array(self._given) == number)
             gone = self._touched.known[np.setdiff1d(before, wanted)]
             same = (session.points.known[:, None] == gone).all(axis=2).any(axis=1)
-            new = self._contacts(np.setdiff1d(wanted, before))
+            new = _arguments(self._touched.with_known(np.setdiff1d(wanted, before)))
             if same.any():
                 session.add(withdraw=np.flatnonzero(same), **new)
             elif new:
@@ -325,7 +324,8 @@ class Scene:
         new = np.where(costs[better, every] < kept - _FEWEST_GAINED, better, np.array(given))
         new[new == len(self._names)] = NOBODY
         overlap = self._overlaps(pools, chosen)
-        energy = float(costs[new, every].sum()) + own + overlap
+        fitted = sum(min(int((new == number).sum()), FREEDOMS) for number in present)
+        energy = float(costs[new, every].sum()) + own + overlap + _FITTED * fitted
         worst = float(costs[new, every].max())
         return _Joint(energy, tuple(int(one) for one in new), worst=worst)
 
@@ -390,9 +390,7 @@ class Scene:
             problem = self._problem(session, points)
             found = session.method.register(problem, NullObserver())
             poses = Poses.of(found.object_from_world[~found.duplicate])
-            own = pose_energies(
-                self._problem(session, KnownPoints(free=free)), poses, noise=self._model
-            )
+            own = self._own(session, poses)
             surfaces = apply(poses.world_from_object, self._surfaces[number])
             self._pools[number, contacts] = _Pool(
                 poses,
@@ -401,6 +399,15 @@ class Scene:
                 surfaces=surfaces,
             )
         return self._pools[number, contacts]
+
+    def _own(self, session: Session, poses: Poses) -> FloatArray:
+        """Return the energies (B,) of poses by free space and prior alone, nats."""
+        free = KnownPoints(free=session.points.free)
+        if free.count:
+            return pose_energies(self._problem(session, free), poses, noise=self._model)
+        started = session.started
+        none = np.zeros(len(poses))
+        return none if started.prior is None else started.prior.energies(poses, started.sdf)
 
     def _problem(self, session: Session, points: KnownPoints) -> RegistrationProblem:
         started = session.started
@@ -438,6 +445,16 @@ class Scene:
             pools[number] = _Pool(poses, none, own=own, surfaces=surfaces)
         chosen = self._combination(pools, ())
         return {n: pools[n].poses[[at]].world_from_object[0] for n, at in chosen.items()}
+
+
+def _arguments(contacts: KnownPoints) -> dict[str, Any]:
+    """Return contacts as `Session.add` takes them; nothing for none."""
+    if len(contacts.known) == 0:
+        return {}
+    if not contacts.has_normals:
+        return {"contacts": contacts.known}
+    noise = contacts.normal_noise
+    return {"contacts": contacts.known, "normals": contacts.normals, "normal_noise": noise}
 
 
 def _overlap_cost(depths: FloatArray) -> FloatArray:

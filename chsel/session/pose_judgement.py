@@ -17,14 +17,14 @@ from chsel.problem.surface import signed_distances
 from chsel.problem.trust import DETERMINED, NOTHING, explaining, mode_width, pose_energies
 from chsel.session.judging import noise_of, search_for
 
-CONFIRMED, UNDECIDED, CONTRADICTED, UNEXPLAINED = JUDGEMENTS = (
-    "confirmed",
-    "undecided",
-    "contradicted",
-    "nothing fits",
-)
-"""All that the points say is near the pose; it is one of several; others explain the points, and
-this pose does not; no pose explains them."""
+CONFIRMED = "confirmed"
+"""All poses that explain the points are near it."""
+UNDECIDED = "undecided"
+"""It is one of several."""
+CONTRADICTED = "contradicted"
+"""Other poses explain the points, and it does not."""
+UNEXPLAINED = "nothing fits"
+"""No pose explains them."""
 _INLIER = 0.005  # m
 
 
@@ -32,7 +32,7 @@ _INLIER = 0.005  # m
 class PoseJudgement:
     """What points say of a pose."""
 
-    verdict: str  # one of JUDGEMENTS
+    verdict: str  # CONFIRMED, UNDECIDED, CONTRADICTED or UNEXPLAINED
     above: float  # nats by which it explains the points worse than the best pose that was found
     inliers: float  # share of the known points within 5 mm of what they should be
     # (K, 4, 4): poses that explain the points as well, the likeliest first.
@@ -42,7 +42,7 @@ class PoseJudgement:
 
     @property
     def farthest(self) -> float:
-        """How far the farthest pose that explains as much is from it, metres."""
+        """Distance of the farthest pose that explains as much, metres."""
         return float(self.apart.max())
 
     def __str__(self) -> str:
