@@ -1,36 +1,64 @@
-"""A node: contacts and depth images in, plausible poses of the object out. See docs/serve.md."""
+"""A node: contacts, wrenches and depth images in, plausible poses out. See docs/serve.md."""
+
+import importlib
 
 import rclpy
-from geometry_msgs.msg import Point, PointStamped, Pose, PoseArray, Quaternion
+from geometry_msgs.msg import PointStamped, PoseStamped, WrenchStamped
 from message_filters import Subscriber, TimeSynchronizer
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
-from tf2_ros import Buffer, TransformException, TransformListener
+from tf2_ros import Buffer, TransformBroadcaster, TransformException, TransformListener
 
 import chsel
 from chsel_touch.bridge import Bridge
 
 
+class Types(dict):
+    """Message classes by their names, such as std_msgs/msg/String."""
+
+    def __missing__(self, name):
+        package, _, message = name.split("/")
+        self[name] = getattr(importlib.import_module(f"{package}.msg"), message)
+        return self[name]
+
+
 class TouchNode(Node):
     def __init__(self):
         super().__init__("chsel_touch")
-        mesh, record, self.world = (
+        mesh, record, hand, self.world, frame = (
             self.declare_parameter(name, default).value
-            for name, default in (("mesh", ""), ("record", ""), ("world", "world"))
+            for name, default in (
+                ("mesh", ""),
+                ("record", ""),
+                ("hand", ""),
+                ("world", "world"),
+                ("frame", "object"),
+            )
         )
+        least_force = self.declare_parameter("least_force", 2.0).value
         self.session = chsel.Session(mesh, record=record or None)
-        self.bridge = Bridge(self.session, self.transform_to_world)
+        self.bridge = Bridge(
+            self.session,
+            self.transform_to_world,
+            Types(),
+            world=self.world,
+            frame=frame,
+            hand=chsel.load_mesh(hand) if hand else None,
+            least_force=least_force,
+        )
         self.seen = None
         self.buffer = Buffer()
         self.listener = TransformListener(self.buffer, self)
-        self.poses = self.create_publisher(PoseArray, "poses", 1)
-        self.trust = self.create_publisher(String, "trust", 1)
-        self.create_subscription(PointStamped, "contact", self.contact, 10)
+        self.broadcaster = TransformBroadcaster(self)
+        self.publishers_of = {}
+        self.create_subscription(PointStamped, "contact", self.adding("contact"), 10)
+        self.create_subscription(PoseStamped, "contact_normal", self.adding("contact_normal"), 10)
+        if hand:
+            self.create_subscription(WrenchStamped, "wrench", self.adding("wrench"), 10)
         images = [Subscriber(self, Image, "depth"), Subscriber(self, CameraInfo, "camera_info")]
         self.images = TimeSynchronizer(images, 2)
         self.images.registerCallback(lambda *pair: setattr(self, "seen", pair))
@@ -41,8 +69,9 @@ class TouchNode(Node):
         wait = Duration(seconds=0.5)
         return self.buffer.lookup_transform(self.world, header.frame_id, stamp, wait).transform
 
-    def contact(self, message):
-        self.update(lambda: self.bridge.contact(message))
+    def adding(self, name):
+        """Return what takes a message of a topic."""
+        return lambda message: self.update(lambda: getattr(self.bridge, name)(message))
 
     def look(self, _, answer):
         """Add the newest depth image."""
@@ -53,22 +82,21 @@ class TouchNode(Node):
         return answer
 
     def update(self, add):
-        """Add something, publish the poses by all that is known, and say what went wrong."""
+        """Add something, publish what is found by all that is known, and say what went wrong."""
         try:
-            add()
-            found = zip(*self.bridge.poses(), strict=True)
+            if add() is False:  # nothing new
+                return ""
+            found = self.bridge.results(self.get_clock().now().to_msg())
         except (chsel.ChselError, TransformException) as error:
             self.get_logger().error(str(error))
             return str(error)
-        message = PoseArray()
-        message.header.frame_id = self.world
-        message.header.stamp = self.get_clock().now().to_msg()
-        for position, (x, y, z, w) in found:
-            place = Point(**dict(zip("xyz", map(float, position), strict=True)))
-            turn = Quaternion(x=float(x), y=float(y), z=float(z), w=float(w))
-            message.poses.append(Pose(position=place, orientation=turn))
-        self.poses.publish(message)
-        self.trust.publish(String(data=str(self.session.trust)))
+        for topic, message in found:
+            if topic == "tf":
+                self.broadcaster.sendTransform(message)
+                continue
+            if topic not in self.publishers_of:
+                self.publishers_of[topic] = self.create_publisher(type(message), topic, 1)
+            self.publishers_of[topic].publish(message)
         return ""
 
 
