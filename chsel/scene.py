@@ -5,10 +5,10 @@
 in nats: e is minus the logarithm of the density of contact c, on the object that assignment a gives
 it, or on none, by the model of `chsel.problem.noise`; f_i that of free space and of what is known
 beforehand of object i; g_i says that contacts of one object are near each other, within its size,
-and that its first six are fitted whatever they are, as a pose is free to do so: each costs what it
-narrows the poses by, ln(EXTENT / 1.5 mm). h_ij says that no object is inside another. Poses X are
-those that the method finds for the contacts that an object has been given; assignments and poses
-are improved in turn, from several starts.
+and that its first six are fitted whatever they are, as a pose is free to do so: they are as likely
+here as anywhere within EXTENT, like those on none. h_ij says that no object is inside another.
+Poses X are those that the method finds for the contacts that an object has been given; assignments
+and poses are improved in turn, from several starts.
 """
 
 from __future__ import annotations
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 NOBODY = -1
 """The number of no object, of a contact on something else."""
 _FEWEST_GAINED = 1.0  # nats for which a contact changes to another object
-_FITTED = 4.6  # nats, of each of the first six contacts of an object
 _FITS = 6.0  # nats: a contact that costs less is explained
 _ROUNDS = 3  # of assignments and poses in turn, at most
 _NEAR = 0.35  # of the diameter: deviation of contacts from their middle
@@ -254,6 +253,11 @@ class Scene:
         """The cost of a contact on none of the objects, nats."""
         return float(np.log(self._model.greatest(np.zeros(1))[0] * EXTENT / SHARE))
 
+    @property
+    def _of_fitted(self) -> float:
+        """The cost of each of the first contacts of an object beside its distance, nats."""
+        return self._of_nobody + float(np.log(SHARE))
+
     def _solutions(self) -> Iterator[_Joint]:
         """Yield what each start comes to, the assignment before first.
 
@@ -325,7 +329,7 @@ class Scene:
         new[new == len(self._names)] = NOBODY
         overlap = self._overlaps(pools, chosen)
         fitted = sum(min(int((new == number).sum()), FREEDOMS) for number in present)
-        energy = float(costs[new, every].sum()) + own + overlap + _FITTED * fitted
+        energy = float(costs[new, every].sum()) + own + overlap + self._of_fitted * fitted
         worst = float(costs[new, every].max())
         return _Joint(energy, tuple(int(one) for one in new), worst=worst)
 

@@ -66,18 +66,18 @@ def distances_apart_from(sdf: SdfGrid, poses: Poses, *, other: Poses) -> FloatAr
     return np.minimum(apart, outline_distances_to(sdf, copies, other=other))
 
 
-def turned(sdf: SdfGrid, poses: Poses, *, pairs: BoolArray) -> BoolArray:
+def turned(sdf: SdfGrid, poses: Poses, *, pairs: BoolArray, more_than: float = TURN) -> BoolArray:
     """Return flags (B, B) of those pairs of poses that differ by a rotation that is no symmetry.
 
-    Such a rotation is larger than TURN. Where symmetries are declared, it is so after each of them;
-    else about the object's middle it moves the surface by more than SYMMETRIC of the diameter, root
-    mean square.
+    Such a rotation is larger than an angle, radians. Where symmetries are declared, it is so after
+    each of them; else about the object's middle it moves the surface by more than SYMMETRIC of the
+    diameter, root mean square.
     """
-    one, other = np.nonzero(np.triu(pairs & (angles_apart(poses) > TURN), 1))
+    one, other = np.nonzero(np.triu(pairs & (angles_apart(poses) > more_than), 1))
     result = np.zeros_like(pairs)
     turns = product(poses.rotations[one], np.swapaxes(poses.rotations[other], 1, 2))
     if sdf.symmetry is not None:
-        moved = sdf.symmetry.rotation_errors(turns) > TURN
+        moved = sdf.symmetry.rotation_errors(turns) > more_than
     else:
         outline, centre = outline_in_object(sdf), middle(sdf)
         about = Poses.of(compose(turns, centre - rotated(turns, centre)))

@@ -10,11 +10,19 @@ from chsel.methods.anchored.anchored import Anchored
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.noise import noise_model
-from chsel.problem.pose_distances import distances_apart_from, turned
-from chsel.problem.poses import Poses, inverse
+from chsel.problem.pose_distances import distances_apart_from, middle, turned
+from chsel.problem.poses import Poses, apply, inverse
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.surface import signed_distances
-from chsel.problem.trust import DETERMINED, NOTHING, explaining, mode_width, pose_energies
+from chsel.problem.trust import (
+    DETERMINED,
+    NOTHING,
+    SURE_TURN,
+    explaining,
+    mode_width,
+    pose_energies,
+    sure_within,
+)
 from chsel.session.judging import noise_of, search_for
 
 CONFIRMED = "confirmed"
@@ -65,7 +73,8 @@ def judged_pose(
     hypotheses: of the problem, by the method, with trust. A pose is contradicted where it explains
     the points worse than the best hypothesis by more than 9 nats, though errors that points may
     share cost nothing (`Anchored.holds`), and confirmed where the verdict on the hypotheses is
-    determined, and their pose a neighbour of this one: no further than the width of a mode.
+    determined, and their pose a neighbour of this one: no further than the width of a mode, with a
+    centre and a turn no further than `sure_within` and SURE_TURN.
     """
     trust = hypotheses.trust
     assert trust is not None
@@ -78,8 +87,11 @@ def judged_pose(
     energies = pose_energies(carried, Poses.joined([pose, likely]), noise=noise_model(noise))
     apart = distances_apart_from(carried.sdf, likely, other=pose)
     both = Poses.joined([pose, likely])
-    differ = turned(carried.sdf, both, pairs=np.ones((len(both), len(both)), dtype=bool))[0, 1:]
-    others = (apart > mode_width(carried.sdf, noise)) | differ
+    every = np.ones((len(both), len(both)), dtype=bool)
+    differ = turned(carried.sdf, both, pairs=every, more_than=SURE_TURN)[0, 1:]
+    centres = apply(both.world_from_object, middle(carried.sdf)[None])[:, 0]
+    away = np.sqrt(((centres[1:] - centres[0]) ** 2).sum(axis=1)) > sure_within(carried.sdf, noise)
+    others = (apart > mode_width(carried.sdf, noise)) | differ | away
     points = carried.points
     off = np.abs(signed_distances(carried.sdf, pose, points=points.known)[0] - points.sdf)
     if trust.verdict == NOTHING:
