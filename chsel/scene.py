@@ -281,10 +281,16 @@ class Scene:
         return fewest > FREEDOMS and joint.worst < _FITS
 
     def _starts(self) -> Iterator[tuple[int, ...]]:
-        """Yield assignments to begin with: that before, all on one object, and by place."""
+        """Yield assignments to begin with.
+
+        They are that before, the same with what is on none given to each object in turn, all on one
+        object, and by place.
+        """
         count = len(self._names)
         if any(one != NOBODY for one in self._given):
             yield self._given
+            for number in range(count):
+                yield tuple(number if one == NOBODY else one for one in self._given)
         for number in range(count):
             yield (number,) * len(self._given)
         for groups in range(2, count + 1):
