@@ -45,7 +45,8 @@ NOBODY = -1
 """The number of no object, of a contact on something else."""
 _FEWEST_GAINED = 1.0  # nats for which a contact changes to another object
 _FITS = 6.0  # nats: a contact that costs less is explained
-_ROUNDS = 3  # of assignments and poses in turn, at most
+_GONE_ON_WITH = 3  # starts
+_ROUNDS = 2  # of assignments and poses in turn, after the first, at most
 _NEAR = 0.35  # of the diameter: deviation of contacts from their middle
 _OVERLAP = 0.004  # m: a depth inside of another object that is no surprise
 _MOST_OVERLAP = 20.0  # nats
@@ -259,22 +260,26 @@ class Scene:
         return self._of_nobody + float(np.log(SHARE))
 
     def _solutions(self) -> Iterator[_Joint]:
-        """Yield what each start comes to, the assignment before first.
+        """Yield what each start comes to in a round, and what the best of them come to.
 
-        Where that explains more contacts of each object than a pose is free to fit, it stands.
+        Where the assignment before explains more contacts of each object than a pose is free to
+        fit, it stands.
         """
-        seen: set[tuple[int, ...]] = set()
+        done: dict[tuple[int, ...], _Joint] = {}
         for start in self._starts():
-            given = start
+            if start not in done:
+                done[start] = self._best(start)
+                yield done[start]
+            if start == self._given == done[start].given and self._stands(done[start]):
+                return
+        for joint in sorted(done.values(), key=lambda one: one.energy)[:_GONE_ON_WITH]:
+            given = joint.given
             for _ in range(_ROUNDS):
-                if given in seen:
+                if given in done:
                     break
-                seen.add(given)
-                joint = self._best(given)
-                yield joint
-                if given == self._given == joint.given and self._stands(joint):
-                    return
-                given = joint.given
+                done[given] = self._best(given)
+                yield done[given]
+                given = done[given].given
 
     def _stands(self, joint: _Joint) -> bool:
         fewest = min(joint.given.count(number) for number in range(len(self._names)))
