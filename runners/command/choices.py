@@ -18,13 +18,12 @@ from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.policies import POLICIES, policy_settings
 from chsel.problem.settings import PRESETS, in_preset, settings_mapping
-from runners.objects.loader import OBJECTS, ObjectConfig
+from runners.objects.loader import FITTED, OBJECTS, ObjectConfig
 from runners.objects.scans import URL
 from runners.run.grasps import GraspConfig
 from runners.run.recording import RecordingConfig
 from runners.sensors.rig import Rig
 from runners.sessions import KINDS, kinds_of
-from runners.sessions.configurations import FITTED
 from runners.sessions.faults import LEVELS
 from runners.sessions.source import ObjectOrigin
 

@@ -18,14 +18,16 @@ from replay.arguments import chosen_steps
 from runners.evaluation.contenders import Contender
 from runners.evaluation.metrics import MetricsConfig, definition_label, definition_settings
 from runners.evaluation.trial_configurations import (
+    HOUSEHOLD,
     MOST_PROBES,
     SENSORS,
     TrialConfiguration,
     configurations_of,
+    household_configurations,
     object_values,
     recorded_object,
 )
-from runners.objects.loader import ObjectConfig
+from runners.objects.loader import FITTED, ObjectConfig
 from runners.sessions import kinds_of, session_settings
 from runners.sessions.faults import CLEAN, LEVELS, level_name
 from runners.sessions.probing_settings import ProbingSettings
@@ -33,7 +35,8 @@ from runners.sessions.source import ObjectOrigin
 
 SESSIONS = (*kinds_of(ObjectOrigin.PLACED), SENSORS)
 OWN = "own"
-OBJECTS = {"models": "", "scans": "ycb/"}  # before the names of objects, by what they are
+OBJECTS = {"models": "", "scans": "ycb/", HOUSEHOLD: "household/"}
+"""What comes before the names of objects, by what they are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +46,7 @@ class Plan:
     folder: Path
     preset: str
     session: Mapping[str, Any]  # settings, with kind
-    objects: str  # "models" or "scans"
+    objects: str  # one of OBJECTS
     definition: Mapping[str, Any]  # of the plausible sets, epsilon None for that of the object
     metrics: MetricsConfig
     steps: str | None
@@ -77,6 +80,8 @@ class Plan:
     @cached_property
     def configurations(self) -> dict[str, TrialConfiguration]:
         """Configurations of this kind by name, also those not chosen."""
+        if self.objects == HOUSEHOLD and self.kind != SENSORS:
+            return household_configurations()
         return configurations_of(self.kind, self.logs)
 
     @property
@@ -121,7 +126,8 @@ class Plan:
             # A pose beside the log is a guess here, from which the true pose is sought.
             return {**self.session, "path": str(trial.log(self)), "pose": "none"}
         of = self.configurations[trial.configuration]
-        values = {**self.session, "configuration": of.clean_name}
+        place = FITTED if self.objects == HOUSEHOLD else of.clean_name
+        values = {**self.session, "configuration": place}
         return values if of.faults == CLEAN else values | {"faults": asdict(LEVELS[of.faults])}
 
     def session_settings(self, trial: Trial) -> Any:

@@ -11,13 +11,15 @@ from typing import Any
 
 from chsel.errors import ChselError, SettingError, require_choice
 from chsel.problem.settings import build_settings, settings_mapping
-from runners.objects.loader import OBJECTS, ObjectConfig
+from runners.objects.loader import HOUSEHOLDS, OBJECTS, ObjectConfig
 from runners.sensors.pose_file import read_yaml
 from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.faults import CLEAN, LEVELS
+from runners.sessions.fitted import FITTED_PROBES
 from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
 
 SENSORS = "sensors"
+HOUSEHOLD = "households"
 MOST_PROBES = 1_000
 OBJECT_FILE = "object.yaml"
 _SEED_LIMIT = 2**63  # a column of the table holds them
@@ -69,6 +71,17 @@ def configurations_of(kind: str, logs: Path | None = None) -> dict[str, TrialCon
     if set(there) <= set(simulated):
         return simulated
     return {name: simulated.get(name) or _recorded(name, path) for name, path in there.items()}
+
+
+def household_configurations() -> dict[str, TrialConfiguration]:
+    """Return a configuration for each household object, by name, with levels of faults."""
+    return {
+        (name := faulty_name(thing, level)): TrialConfiguration(
+            name, thing, probes=FITTED_PROBES, faults=level
+        )
+        for thing in HOUSEHOLDS
+        for level in LEVELS
+    }
 
 
 def faulty_name(configuration: str, level: str) -> str:

@@ -21,6 +21,10 @@ from runners.objects.scans import SCANS, scan_file
 if TYPE_CHECKING:
     import trimesh
 
+_HERE = Path(__file__).parent
+FITTED = "fitted"
+"""The configuration that is made for an object of any size, see `fitted_configuration`."""
+
 
 @dataclass(frozen=True)
 class ObjectConfig(CheckedSettings):
@@ -30,8 +34,8 @@ class ObjectConfig(CheckedSettings):
     scale: Annotated[float, positive]  # multiplies the mesh into the metres of the session
     epsilon: Annotated[float, positive]  # tolerance of the plausible set, metres (CHSEL, Sec. V)
     configuration: str  # how simulated sessions place and probe it
-    kind: Annotated[str, one_of("model", "scan", "file")] = "model"
-    """"model" ships with the project, "scan" is of the YCB set."""
+    kind: Annotated[str, one_of("model", "household", "scan", "file")] = "model"
+    """"model" and "household" ship with the project, "scan" is of the YCB set."""
     path: str | None = None  # the mesh, for "file"
     scan: str | None = None  # official folder name, for "scan"
     tessellation: Annotated[float, positive] = TESSELLATION  # of STEP files, see load_mesh, metres
@@ -74,6 +78,28 @@ OBJECTS = {
 }
 OBJECTS |= {
     f"ycb/{name}": replace(OBJECTS[name], kind="scan", scan=scan) for scan, name in SCANS.items()
+}
+HOUSEHOLDS = (
+    "mug",
+    "bowl",
+    "plate",
+    "bottle",
+    "wine_glass",
+    "pan",
+    "spoon",
+    "screwdriver",
+    "wrench",
+    "remote",
+    "bulb",
+    "roll",
+    "iron",
+)
+"""Things of usual sizes on which no method was tuned, files in `households/`."""
+OBJECTS |= {
+    f"household/{name}": ObjectConfig(
+        name, 1.0, epsilon=0.001, configuration=FITTED, kind="household"
+    )
+    for name in HOUSEHOLDS
 }
 """The choices of `object=` but for mesh files."""
 PAPER_RESOLUTION = 0.010  # m: of the SDF grids of these in the paper's simulated trials
@@ -138,6 +164,9 @@ def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:
         mesh = load_mesh(path, scale=config.scale, tessellation=config.tessellation)
     elif config.kind == "scan":
         mesh = load_mesh(scan_file(assets, config.scan or ""), scale=config.scale)
+    elif config.kind == "household":
+        require_choice("object.name", config.name, accepted=HOUSEHOLDS)
+        mesh = load_mesh(_HERE / "households" / f"{config.name}.ply", scale=config.scale)
     else:
         mesh = load_model(config.name, config.scale)
     return ObjectModel(
@@ -164,7 +193,7 @@ def _symmetry(config: ObjectConfig) -> ObjectSymmetry | None:
 def _of_paper(config: ObjectConfig) -> bool:
     """Return whether an object is one of the paper's simulated trials, at its scale there."""
     shipped = config.kind == "model" or SCANS.get(config.scan or "") == config.name
-    return shipped and config.kind != "file" and config.scale == _TRIALS[config.name][0]
+    return shipped and config.kind in ("model", "scan") and config.scale == _TRIALS[config.name][0]
 
 
 def check_size(model: ObjectModel, workspace: Workspace) -> list[MeshWarning]:
@@ -186,4 +215,4 @@ def check_size(model: ObjectModel, workspace: Workspace) -> list[MeshWarning]:
 def load_model(name: str, scale: float = 1.0) -> trimesh.Trimesh:
     """Return one of MODELS in the frame of its YCB mesh; metres at scale 1."""
     require_choice("object.name", name, accepted=MODELS)
-    return load_mesh(Path(__file__).parent / "models" / f"{name}.ply", scale=scale)
+    return load_mesh(_HERE / "models" / f"{name}.ply", scale=scale)

@@ -7,11 +7,9 @@ from math import pi
 
 from chsel.errors import require_choice
 from chsel.problem.points import Workspace
+from runners.objects.loader import FITTED
 
 Triple = tuple[float, float, float]
-
-FITTED = "fitted"
-"""The configuration that is made for an object of any size, see `fitted_configuration`."""
 
 WORKSPACE = Workspace((-0.1, -0.3, -0.075), (0.5, 0.3, 0.625))
 HAMMER_WORKSPACE = Workspace((-0.1, -0.3, -0.075), (0.5, 0.5, 0.4))

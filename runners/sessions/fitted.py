@@ -10,7 +10,8 @@ import numpy as np
 from chsel.next_probe.action_lattice import CLEARANCE
 from chsel.problem.points import FREE_RESOLUTION, Workspace
 from chsel.problem.poses import apply
-from runners.sessions.configurations import FITTED, Configuration
+from runners.objects.loader import FITTED
+from runners.sessions.configurations import Configuration
 from runners.sessions.gripper import X_REST
 from runners.sessions.placement import laid_down
 from runners.sessions.probing_hand import ProbingHand
@@ -22,6 +23,7 @@ GAP = 0.05  # m: between the object and the hand before it
 _YAW = 0.5  # radians: a box shows the hand two of its sides
 _ACROSS = (0.0, 0.5, -0.5, 0.85, -0.85)  # y of probes, in halves of the width that they can meet
 _UP = (0.15, 0.4, 0.6, 0.85)  # z of probes, in heights that they can meet
+FITTED_PROBES = len(_ACROSS) * len(_UP)
 _BELOW = 3  # free voxels in the workspace below the object
 
 

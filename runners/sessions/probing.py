@@ -25,9 +25,8 @@ from chsel.problem.pose_prior import prior_from_settings
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.streams import Purpose, StreamKey, normals
-from runners.objects.loader import ObjectModel
+from runners.objects.loader import FITTED, ObjectModel
 from runners.sessions.configurations import (
-    FITTED,
     WORKSPACE,
     Configuration,
     find_configuration,

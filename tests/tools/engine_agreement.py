@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from runners.objects.loader import OBJECTS, load_model
+from runners.objects.loader import MODELS, OBJECTS, load_model
 from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.physics_engine import ENGINES
 from runners.sessions.probing import open_probing
@@ -30,7 +30,7 @@ def main():
             session.close()
             seconds[label] += time.process_time() - begun
     probes = sum(len(found["kinematic", name]) for name in CONFIGURATIONS)
-    print(f"{probes} probes of {len(CONFIGURATIONS)} configurations, {len(OBJECTS) // 2} objects")
+    print(f"{probes} probes of {len(CONFIGURATIONS)} configurations, {len(MODELS)} objects")
     print("processor time:", ", ".join(f"{name} {value:.0f} s" for name, value in seconds.items()))
     for one, other in combinations(KINDS, 2):
         distances, alone = [], 0
