@@ -46,6 +46,7 @@ NOBODY = -1
 _FEWEST_GAINED = 1.0  # nats for which a contact changes to another object
 _FITS = 6.0  # nats: a contact that costs less is explained
 _GONE_ON_WITH = 3  # starts
+_MOST_OBJECTS = 4  # as starts are assignments by place in every order
 _ROUNDS = 2  # of assignments and poses in turn, after the first, at most
 _NEAR = 0.35  # of the diameter: deviation of contacts from their middle
 _OVERLAP = 0.004  # m: a depth inside of another object that is no surprise
@@ -85,7 +86,9 @@ class Scene:
     """Sessions of several objects, each of which is there once or not at all.
 
     sessions: by name. objects: at the last registration, by name. owners (M,): names of the objects
-    of all contacts, in the order in which they came, "" of those on none.
+    of all contacts, in the order in which they came, "" of those on none. margin: nats by which the
+    next best of the assignments that were tried explains less than theirs; within 9 or so, touches
+    may be of others. Infinite where none was tried.
     """
 
     def __init__(
@@ -104,12 +107,14 @@ class Scene:
         record: a new file NAME.mcap; each object has its own, NAME_OBJECT.mcap. priors: what is
         known beforehand of the poses of some, by name. noise, given: the same for all, see
         `chsel.Session`; objects stand still.
-        Raises SettingError for fewer than two, two of one name, and moves.
+        Raises SettingError for fewer than two or more than four, two of one name, and moves.
         """
         named = targets if isinstance(targets, Mapping) else {Path(t).stem: t for t in targets}
         if len(named) < max(len(targets), 2):
             shown = quoted(list(targets))
-            raise SettingError(f"targets are {shown}; accepted: two or more, of different names")
+            raise SettingError(f"targets are {shown}; accepted: two to four, of different names")
+        if len(named) > _MOST_OBJECTS:
+            raise SettingError(f"there are {len(named)} targets; accepted: two to {_MOST_OBJECTS}")
         if given.get("moves"):
             raise SettingError(f"moves is {given['moves']}; accepted: 0, as objects stand still")
         priors = {} if priors is None else priors
@@ -117,6 +122,7 @@ class Scene:
             require_choice("a name in priors", name, accepted=named)
         self.sessions: dict[str, Session] = {}
         self.objects: dict[str, SceneObject] = {}
+        self.margin = np.inf
         self._lock = threading.RLock()
         self._touched = KnownPoints()
         self._given: tuple[int, ...] = ()  # of contacts
@@ -187,7 +193,10 @@ class Scene:
             if len(self._given) == 0:
                 raise PointsError("nothing was touched yet; accepted: a registration after `add`")
             self._pools = {}
-            best = min(self._solutions(), key=lambda one: one.energy)
+            found = list(self._solutions())
+            best = min(found, key=lambda one: one.energy)
+            others = [one.energy for one in found if one.given != best.given]
+            self.margin = min(others, default=np.inf) - best.energy
             self._give(best.given)
             answers: dict[int, Hypotheses] = {}
             for number, session in enumerate(self.sessions.values()):

@@ -214,6 +214,19 @@ def solved(name: str, policy: str) -> str:
     return percent((errors.min(axis=1) < statistics.GOOD).mean())
 
 
+def held_by_modes(name: str) -> str:
+    """The share of results with modes whose ellipsoids of 90 % hold the true pose."""
+    held = evaluation(name).probes["modes_90"].dropna()
+    return percent_range(
+        statistics.shares(pd.DataFrame({"all": 0, "flag": held}), "all", column="flag").iloc[0]
+    )
+
+
+def things(name: str) -> int:
+    """How many objects an evaluation has."""
+    return int(evaluation(name).probes["object"].nunique())
+
+
 def _speeds() -> dict[tuple[str, str], str]:
     """Milliseconds by problem and registration, of docs/speed.md."""
     lines = (DOCS / "speed.md").read_text().splitlines()

@@ -43,6 +43,7 @@ def test_touches_are_given_to_their_objects_which_are_found(tmp_path):
             scene.add(contacts=places[n : n + 4])
             scene.register()
         assert scene.owners == names
+        assert scene.margin > 9.0
         scene.add(contacts=NOWHERE[None], free=[[0.3, -0.3, 0.3]])
         objects = scene.register()
         assert scene.owners == [*names, ""]
@@ -71,6 +72,15 @@ def test_an_object_that_nothing_touched_has_no_answer():
         assert objects["long"].answer is None
         assert objects["long"].world_from_object is None
         assert len(objects["long"].contacts) == 0
+
+
+def test_few_touches_leave_open_whose_they_are():
+    """Two on each of two objects fit both, and the margin says so."""
+    places, _ = touches(2)
+    with chsel.Scene(MESHES, workspace=WORKSPACE) as scene:
+        scene.add(contacts=places)
+        scene.register()
+        assert scene.margin < 9.0
 
 
 def test_the_next_touch_is_for_the_object_that_is_asked_about():
@@ -111,7 +121,8 @@ def test_what_cannot_be_added_is_added_to_none(given, message):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"targets": {"one": MESHES["knob"]}}, "accepted: two or more, of different names"),
+        ({"targets": {"one": MESHES["knob"]}}, "accepted: two to four, of different names"),
+        ({"targets": dict.fromkeys("abcde", MESHES["knob"])}, "5 targets; accepted: two to 4"),
         ({"moves": 0.01}, "moves is 0.01; accepted: 0"),
         ({"priors": {"other": None}}, "a name in priors is 'other'; accepted: knob, long"),
     ],
