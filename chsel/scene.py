@@ -27,7 +27,15 @@ from chsel.errors import PointsError, SettingError, quoted, require_choice
 from chsel.next_probe.decision_problem import Actions
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.initial_sets import posed_problem
-from chsel.problem.noise import EXTENT, FREEDOMS, SHARE, PosedNormals, noise_model, normal_factors
+from chsel.problem.noise import (
+    EXTENT,
+    FREEDOMS,
+    LIMIT,
+    SHARE,
+    PosedNormals,
+    noise_model,
+    normal_factors,
+)
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.pose_prior import PosePrior
 from chsel.problem.poses import Poses, apply
@@ -87,8 +95,8 @@ class Scene:
 
     sessions: by name. objects: at the last registration, by name. owners (M,): names of the objects
     of all contacts, in the order in which they came, "" of those on none. margin: nats by which the
-    next best of the assignments that were tried explains less than theirs; within 9 or so, touches
-    may be of others. Infinite where none was tried.
+    next best of the assignments that were tried explains less than theirs; below 9 touches may be
+    of others. Where an assignment stands, it is that of when others were tried last.
     """
 
     def __init__(
@@ -122,7 +130,7 @@ class Scene:
             require_choice("a name in priors", name, accepted=named)
         self.sessions: dict[str, Session] = {}
         self.objects: dict[str, SceneObject] = {}
-        self.margin = np.inf
+        self.margin = 0.0
         self._lock = threading.RLock()
         self._touched = KnownPoints()
         self._given: tuple[int, ...] = ()  # of contacts
@@ -196,7 +204,8 @@ class Scene:
             found = list(self._solutions())
             best = min(found, key=lambda one: one.energy)
             others = [one.energy for one in found if one.given != best.given]
-            self.margin = min(others, default=np.inf) - best.energy
+            if others:
+                self.margin = min(others) - best.energy
             self._give(best.given)
             answers: dict[int, Hypotheses] = {}
             for number, session in enumerate(self.sessions.values()):
@@ -271,8 +280,8 @@ class Scene:
     def _solutions(self) -> Iterator[_Joint]:
         """Yield what each start comes to in a round, and what the best of them come to.
 
-        Where the assignment before explains more contacts of each object than a pose is free to
-        fit, it stands.
+        Where the assignment before explained more than others, and now explains more contacts of
+        each object than a pose is free to fit, it stands.
         """
         done: dict[tuple[int, ...], _Joint] = {}
         for start in self._starts():
@@ -292,7 +301,7 @@ class Scene:
 
     def _stands(self, joint: _Joint) -> bool:
         fewest = min(joint.given.count(number) for number in range(len(self._names)))
-        return fewest > FREEDOMS and joint.worst < _FITS
+        return self.margin > LIMIT and fewest > FREEDOMS and joint.worst < _FITS
 
     def _starts(self) -> Iterator[tuple[int, ...]]:
         """Yield assignments to begin with.
