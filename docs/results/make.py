@@ -175,7 +175,7 @@ def seeds(name: str, method: str | None = None) -> str:
 def definition(name: str) -> str:
     """The plausible sets behind an evaluation's PD, if it has any."""
     every = evaluation(name)
-    return "" if every.experiment["policies"] else every.definition_text
+    return every.definition_text if every.rows["members"].notna().any() else ""
 
 
 def levels(name: str) -> list[str]:

@@ -108,12 +108,13 @@ class RecordedSource(Steerable):
     def retrace(self, run: Run, step: int) -> None:
         """Let a run that has begun come to a step of the recording; probes after it are given.
 
-        With the method of the recording, with its settings, results of the recording count;
+        With the method of the recording, its settings and its seed, results of the recording count;
         another one begins anew, with all points. Raise RecordingError where this version finds
         other values than the recording has.
         """
         recorded = recorded_method(self._recording).build()
         same = type(recorded) is type(run.method) and recorded.settings == run.method.settings
+        same = same and run.started.seed == self.recorded.seed
         offered = (ActionsOffered, Decided)  # as this run has its own
         retraced(
             run,
