@@ -14,6 +14,7 @@ and poses are improved in turn, from several starts.
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from chsel.errors import PointsError, SettingError, quoted, require_choice
+from chsel.errors import PointsError, PointsWarning, SettingError, quoted, require_choice
 from chsel.next_probe.decision_problem import Actions
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.initial_sets import posed_problem
@@ -36,7 +37,7 @@ from chsel.problem.noise import (
     noise_model,
     normal_factors,
 )
-from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.points import MOST_OUTSIDE, KnownPoints, Workspace
 from chsel.problem.pose_prior import PosePrior
 from chsel.problem.poses import Poses, apply
 from chsel.problem.registration_problem import Hypotheses, NullObserver, RegistrationProblem
@@ -183,6 +184,7 @@ class Scene:
             others = any(value is not None for value in what.values())
             if not others and len(touched.known) == 0:
                 raise PointsError("nothing was added; accepted: points, a path or a depth image")
+            self._check(touched)
             given = self._likeliest(touched)
             with ExitStack() as taken:
                 prepared = []
@@ -237,6 +239,20 @@ class Scene:
 
     def __exit__(self, *error: Any) -> None:
         self._open.__exit__(*error)
+
+    def _check(self, touched: KnownPoints) -> None:
+        """Raise PointsError for contacts that are no object's; warn of those that may not be."""
+        if len(touched.known) == 0:
+            return
+        session = max(self.sessions.values(), key=lambda one: one.started.sdf.diameter)
+        session.prepare(**_arguments(touched))
+        away = session.started.workspace.distances(touched.known).max()
+        if away > MOST_OUTSIDE * session.started.sdf.diameter:
+            text = (
+                f"a contact is {away:.3g} m outside of the workspace {session.started.workspace}; "
+                "check workspace, units and frames"
+            )
+            warnings.warn(PointsWarning("contacts_outside", text), stacklevel=3)
 
     def _likeliest(self, touched: KnownPoints) -> IntArray:
         """Return the objects (M,) that new contacts fit best by the last results; NOBODY without.

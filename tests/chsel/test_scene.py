@@ -118,6 +118,15 @@ def test_what_cannot_be_added_is_added_to_none(given, message):
         assert len(scene.owners) == 6
 
 
+def test_a_contact_far_outside_is_a_warning_and_one_in_millimetres_an_error():
+    with chsel.Scene(MESHES, workspace=WORKSPACE) as scene:
+        with pytest.warns(chsel.PointsWarning, match="a contact is 0.1 m outside of the workspace"):
+            scene.add(contacts=[[0.5, 0.0, 0.0]])
+        with pytest.raises(PointsError, match="workspace"):
+            scene.add(contacts=[[120.0, 40.0, 300.0]])
+        assert len(scene.owners) == 1
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
