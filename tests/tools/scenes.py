@@ -109,7 +109,9 @@ def run(seed, count):
                 off = middle - actions.world_from_hand[:, :3, 3]
                 along = actions.world_from_hand[:, :3, 2]
                 aside = np.linalg.norm(off - (off * along).sum(1, keepdims=True) * along, axis=1)
-                chosen = random.choice([i for i in np.flatnonzero(aside < 0.05) if i not in taken])
+                left = np.array([i not in taken for i in range(len(actions))])
+                past = left & (aside < 0.05)
+                chosen = random.choice(np.flatnonzero(past if past.any() else left))
                 taken.add(int(chosen))
                 way = actions.world_from_hand[chosen], float(actions.length[chosen])
             else:
