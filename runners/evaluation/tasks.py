@@ -22,6 +22,7 @@ from runners.evaluation.trial_session import make_session, read_told, recording_
 if TYPE_CHECKING:
     from distributed import Client, Future
 
+_PATIENCE = 20.0  # seconds without a result, after which workers are counted
 _DASK = {
     "distributed.scheduler.allowed-failures": 1,  # the second worker that a task kills is the last
     "distributed.scheduler.worker-ttl": None,  # a long task may keep a worker from answering
@@ -165,12 +166,30 @@ def do_tasks(
                 running[client.submit(do_task, plan, task, pure=False)] = task
             if not running:
                 break
-            for future in wait(list(running), return_when="FIRST_COMPLETED").done:
+            while True:
+                try:
+                    ended = wait(list(running), _PATIENCE, return_when="FIRST_COMPLETED").done
+                    break
+                except TimeoutError:
+                    _replace_workers(client, workers)
+            for future in ended:
                 task = running.pop(future)
                 failure = _failure(future)
                 if failure and not task.label:
                     failed[task.trial] = failure
                 yield task, _note(plan, task, failure=failure)
+
+
+def _replace_workers(client: Client, count: int) -> None:
+    """Start the workers of this machine anew if none is left: Dask may not replace one that dies.
+
+    Such as one that dies before Dask has noticed that it began.
+    """
+    from distributed import LocalCluster
+
+    if isinstance(client.cluster, LocalCluster) and not client.nthreads():
+        client.cluster.scale(0)
+        client.cluster.scale(count)
 
 
 def _failure(future: Future) -> str:

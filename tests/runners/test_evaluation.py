@@ -160,8 +160,23 @@ def _dies(plan, task):
     tasks.do_task(plan, task)
 
 
+async def _nothing():
+    pass
+
+
 def _status(dask_worker):
     return dask_worker.status.name
+
+
+def test_workers_that_dask_does_not_replace_are_started_anew(make_plan, monkeypatch):
+    """As may be where one dies before its nanny knows that it has begun."""
+    monkeypatch.setattr(tasks, "do_task", _dies)
+    monkeypatch.setattr(tasks, "_PATIENCE", 1.0)
+    plan = make_plan([{"name": "icp", "label": "once"}])
+    with connected(None, 1) as own:
+        (nanny,) = own[0].cluster.workers.values()
+        monkeypatch.setattr(nanny, "instantiate", _nothing)
+        assert finished(plan, own)["once"] == ""
 
 
 def test_a_worker_that_dies_once_costs_nothing_and_twice_its_task_alone(
