@@ -154,7 +154,7 @@ def _judge_results(config: JudgeConfig, console: Console) -> None:
 
 
 def _counts(rows: list[_Judged]) -> list[dict[str, Any]]:
-    """Return how many right and wrong poses are told and doubted, and by inliers alone."""
+    """Return how many right and wrong poses are contradicted, and have few inliers."""
     wrong = [one for one in rows if one.error > _WRONG * one.diameter]
     right = [one for one in rows if one.error <= _WRONG * one.diameter]
     lines = []

@@ -602,7 +602,7 @@ class Session:
     def judge(self, world_from_object: Any) -> PoseJudgement:
         """Return what the points say of a pose (4, 4) of another estimator, after a result.
 
-        Raises PoseError for what is no pose, and where the last step has no result with a pose.
+        Raises PoseError for a matrix that is not rigid, and where the last step has no pose.
         """
         pose = frozen("world_from_object", world_from_object, shape=(4, 4), error=PoseError)
         pose = nearest_rigid("world_from_object", pose[None])[0]

@@ -60,7 +60,7 @@ class ProbeConfig:
     seed: int
     threads: int
     configuration: str | None
-    from_step: int | None  # `from`, which is no name in Python
+    from_step: int | None  # `from` of the command line, a keyword of Python
 
     def __post_init__(self) -> None:
         StreamKey(self.seed, 0)

@@ -106,7 +106,7 @@ def test_scans_of_the_trials_have_their_grid_and_other_scans_do_not(ycb_director
         ("object=mesh", r"pass object\.path=FILE"),
         ("object=drill object.scale=0", "scale is 0.0; accepted: a finite number above 0"),
         ("object=drill object.epsilon=-1", "epsilon is -1.0; accepted"),
-        ("object=drill object.kind=photo", "kind is 'photo'; accepted: model, household, scan, file"),
+        ("object=drill object.kind=photo", "accepted: model, household, scan, file"),
         ("object=drill object.name=cup", r"object\.name is 'cup'; accepted: drill, mustard"),
         ("object=ycb/drill object.scan=../x", r"object\.scan is .*accepted: a name such as"),
     ],
