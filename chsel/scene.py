@@ -192,10 +192,10 @@ class Scene:
                     own = _arguments(touched.with_known(given == number))
                     if others or own:
                         prepared.append((session, session.prepare(**what, **own)))
+                self._touched = self._touched.merged(touched)
+                self._given = (*self._given, *given.tolist())
                 for session, one in prepared:
                     taken.callback(session.commit, one)  # all of them, whatever one raises
-            self._touched = self._touched.merged(touched)
-            self._given = (*self._given, *given.tolist())
 
     def register(self) -> dict[str, SceneObject]:
         """Give every contact to an object, and register each that has any, see `objects`."""
@@ -429,14 +429,7 @@ class Scene:
         if (number, contacts) not in self._pools:
             session = self.sessions[self._names[number]]
             chosen = self._touched.with_known(sorted(contacts))
-            free = session.points.free
-            points = KnownPoints(
-                free=free,
-                known=chosen.known,
-                normals=chosen.normals,
-                normal_noise=chosen.normal_noise,
-            )
-            problem = self._problem(session, points)
+            problem = self._problem(session, self._beside(session).merged(chosen))
             found = session.method.register(problem, NullObserver())
             poses = Poses.of(found.object_from_world[~found.duplicate])
             own = self._own(session, poses)
@@ -449,11 +442,17 @@ class Scene:
             )
         return self._pools[number, contacts]
 
+    def _beside(self, session: Session) -> KnownPoints:
+        """Return the points of a session that are no contacts of the scene, such as free ones."""
+        known = session.points.known
+        touched = (known[:, None] == self._touched.known).all(axis=2).any(axis=1)
+        return session.points.with_known(~touched)
+
     def _own(self, session: Session, poses: Poses) -> FloatArray:
-        """Return the energies (B,) of poses by free space and prior alone, nats."""
-        free = KnownPoints(free=session.points.free)
-        if free.count:
-            return pose_energies(self._problem(session, free), poses, noise=self._model)
+        """Return the energies (B,) of poses by prior and points but the contacts, nats."""
+        beside = self._beside(session)
+        if beside.count:
+            return pose_energies(self._problem(session, beside), poses, noise=self._model)
         started = session.started
         none = np.zeros(len(poses))
         return none if started.prior is None else started.prior.energies(poses, started.sdf)

@@ -89,13 +89,23 @@ def test_the_next_touch_is_for_the_object_that_is_asked_about():
     with chsel.Scene(MESHES, workspace=WORKSPACE, hand=finger) as scene:
         scene.add(contacts=places[:14])
         scene.register()
-        for name in MESHES:
-            probe = scene.next_probe(name)
-            session = scene.sessions[name]
-            assert session.stop or probe.decision.digest
-            assert session.problem.sdf.digest == session.started.sdf.digest
+        decided = scene.next_probe("knob").decision
+        assert decided.digest == scene.sessions["knob"]._run.loop.state.decided.decision.digest
+        with pytest.raises(SettingError, match="a probe was chosen before"):
+            scene.next_probe("knob")
+        assert scene.next_probe("long") is not None  # of which none was chosen before
         with pytest.raises(SettingError, match="name is 'other'; accepted: knob, long"):
             scene.next_probe("other")
+
+
+def test_points_of_one_object_say_whose_touches_are():
+    """Three touches fit either; where one object is known to be elsewhere, they are the other's."""
+    places, _ = touches(12)
+    with chsel.Scene(MESHES, workspace=WORKSPACE) as scene:
+        scene.sessions["knob"].add(known=places[::2], known_sdf=np.zeros(12))
+        scene.add(contacts=places[1:6:2])
+        scene.register()
+        assert set(scene.owners) == {"long"}
 
 
 @pytest.mark.parametrize(

@@ -403,8 +403,6 @@ def test_the_end_waits_for_no_computation_and_what_waits_is_not_begun(tmp_path, 
         asked.append(pool.submit(ask, address, f"{busy}/register", b""))
         time.sleep(0.2)  # so that it waits
         ended = asyncio.run_coroutine_threadsafe(runner.cleanup(), loop)
-        time.sleep(0.1)
-        assert not any(answer.done() for answer in asked)  # which have a quarter of a second
         ended.result()
         for name in ("busy", "idle"):
             assert is_interrupted(tmp_path / f"{name}.mcap")

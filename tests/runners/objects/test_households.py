@@ -8,7 +8,21 @@ from runners.objects.loader import HOUSEHOLDS, OBJECTS, load_object
 from runners.sessions.fitted import FITTED_PROBES, fitted_configuration
 from runners.sessions.probing_hand import panda_hand
 
-LARGEST = {"pan": 0.39, "bottle": 0.30, "plate": 0.264, "iron": 0.24, "screwdriver": 0.225}
+LENGTHS = {  # metres
+    "mug": 0.119,
+    "bowl": 0.160,
+    "plate": 0.264,
+    "bottle": 0.300,
+    "wine_glass": 0.200,
+    "pan": 0.388,
+    "spoon": 0.202,
+    "screwdriver": 0.225,
+    "wrench": 0.212,
+    "remote": 0.156,
+    "bulb": 0.107,
+    "roll": 0.116,
+    "iron": 0.237,
+}
 
 
 @pytest.mark.parametrize("name", HOUSEHOLDS)
@@ -18,8 +32,7 @@ def test_a_thing_is_one_closed_solid_of_its_size(name, tmp_path):
     assert mesh.is_watertight
     assert mesh.body_count == 1
     assert 0.0 < mesh.volume < np.prod(mesh.extents)
-    assert mesh.extents.max() == pytest.approx(LARGEST.get(name, mesh.extents.max()), abs=0.005)
-    assert 0.1 < mesh.extents.max() < 0.4
+    assert mesh.extents.max() == pytest.approx(LENGTHS[name], abs=0.001)
     assert not model.of_paper
     assert len(fitted_configuration(mesh, panda_hand()).grid) == FITTED_PROBES
 
